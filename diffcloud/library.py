@@ -27,7 +27,7 @@ from diffcloud.estimation.result import FitResult, FittedMotion, write_fit
 from diffcloud.estimation.settings import FitSettings
 from diffcloud.estimation.solvers import Progress
 from diffcloud.estimation.task import FitTask, Recording, compared
-from diffcloud.evaluation.intervals import Intervals, draws, intervals_of, stated_parameters
+from diffcloud.evaluation.intervals import Intervals, draws, intervals_of, stated_parameters, worded
 from diffcloud.evaluation.methods import space_of
 from diffcloud.identification import fit_settings, found_cloth, known_grip, with_density, with_material_path
 from diffcloud.io.episodes import Episode, read_episode
@@ -61,7 +61,7 @@ class Estimate:
 
     def __str__(self) -> str:
         ends = "" if self.interval is None else f" ({self.interval[0]:.3g} to {self.interval[1]:.3g})"
-        ends += f", {self.status.replace('_', ' ')}" if self.status else ""
+        ends += f", {worded(self.status)}" if self.status else ""
         return f"{self.value:.3g} {self.unit}{ends}"
 
 
@@ -145,7 +145,7 @@ class Fit:
     """Of each recording, with the fitted values."""
 
     def __str__(self) -> str:
-        lines = [f"{self.status.replace('_', ' ')}, residual {1e3 * self.residual:.1f} mm"]
+        lines = [f"{worded(self.status)}, residual {1e3 * self.residual:.1f} mm"]
         return "\n".join([*lines, *(f"{name}: {told}" for name, told in self.parameters.items())])
 
     def _repr_html_(self) -> str:
@@ -155,11 +155,11 @@ class Fit:
                 "parameter": name,
                 "value": f"{one.value:.3g} {one.unit}",
                 "interval": "" if one.interval is None else f"{one.interval[0]:.3g} to {one.interval[1]:.3g}",
-                "status": one.status.replace("_", " "),
+                "status": worded(one.status),
             }
             for name, one in self.parameters.items()
         ]
-        head = f"<p>{self.status.replace('_', ' ')}, residual {1e3 * self.residual:.1f} mm</p>"
+        head = f"<p>{worded(self.status)}, residual {1e3 * self.residual:.1f} mm</p>"
         return head + str(pd.DataFrame(rows).to_html(index=False))
 
     def sample(self, count: int, seed: int = 0) -> pd.DataFrame:

@@ -261,3 +261,16 @@ def test_seven_commands_with_few_options():
     top = get_command(app)
     assert len(top.list_commands(None)) == 7
     assert options(top) <= 135
+
+
+def test_the_light_settings_of_networks_take_what_the_networks_take():
+    """They repeat the choices, because the networks' own module imports torch."""
+    from typing import get_args
+
+    from diffcloud.jobs.network_settings import TrainSettings
+    from diffcloud.regressors.settings import Loss, Profile, Target
+
+    fields = TrainSettings.model_fields
+    assert fields["profile"].annotation == Profile
+    for name, choices in (("loss", Loss), ("target", Target)):
+        assert get_args(fields[name].annotation) == (choices, type(None))

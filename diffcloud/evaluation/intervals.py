@@ -52,6 +52,11 @@ _SHARE = 1 / 3
 """A parameter has its part in a combination from this component on."""
 
 
+def worded(status: str) -> str:
+    """Return a status as people read it: `ratio_only` is "ratio only"."""
+    return status.replace("_", " ")
+
+
 class _Model(Plain):
     model_config = ConfigDict(extra="forbid", allow_inf_nan=True)
 

@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 
 from diffcloud.estimation.initial_state import is_initial_state
-from diffcloud.evaluation.intervals import Combination, significant
+from diffcloud.evaluation.intervals import Combination, significant, worded
 from diffcloud.evaluation.methods import PHASES
 from diffcloud.evaluation.repeats import consistency, fit_of, parameter_table, repeatability, transfer
 
@@ -363,7 +363,7 @@ def overview(told: Tables) -> pd.DataFrame:
         if not statuses.empty:
             for name, part in statuses[statuses["scenario"] == scenario].groupby("parameter", sort=False):
                 status, count = next(iter(part["status"].value_counts().items()))
-                row[f"status_{name}"] = f"{str(status).replace('_', ' ')} ({count}/{len(part)})"
+                row[f"status_{name}"] = f"{worded(str(status))} ({count}/{len(part)})"
         rows.append(row)
     return pd.DataFrame(rows)
 
@@ -411,9 +411,7 @@ def _identified(table: pd.DataFrame) -> list[str]:
         return []
     found = []
     for (scenario, name), group in table.groupby(["scenario", "parameter"], sort=False):
-        counts = ", ".join(
-            f"{str(status).replace('_', ' ')} in {count}" for status, count in group["status"].value_counts().items()
-        )
+        counts = ", ".join(f"{worded(str(status))} in {count}" for status, count in group["status"].value_counts().items())
         text = f"{scenario}: status of {name}: {counts} of {_count(len(group))}"
         if group["factor"].notna().any():
             text += f"; {group['level'].iloc[0]:.0%} intervals end within {_times(group['factor'].median())} (median)"

@@ -65,7 +65,7 @@ def train(
         train_set, test_set = SimulatedSet.read(source, "train"), SimulatedSet.read(source, "test")
         if train_set.scenario != name:
             raise ConfigError(f"{source} holds draws of {train_set.scenario}, not of {name}.")
-        jobs += [TrainJob(kind, train_set, test_set, settings[kind], config, folder, loaders) for kind in config.models]
+        jobs += [TrainJob(kind, train_set, test_set, own, config, folder, loaders) for kind, own in settings.items()]
     for job in jobs:
         errors.print(f"Training {job.label}: {_described(job.settings, job.train)} ...")
     if workers is None and config.device != "cpu" and torch.cuda.is_available():

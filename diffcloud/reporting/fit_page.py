@@ -16,7 +16,7 @@ from diffcloud.estimation.joint import AnyObjective, JointObjective
 from diffcloud.estimation.objective import Objective
 from diffcloud.estimation.record import FitRecord
 from diffcloud.estimation.result import FittedMotion
-from diffcloud.evaluation.intervals import FOLLOWS, Intervals, significant, stated_parameters
+from diffcloud.evaluation.intervals import FOLLOWS, Intervals, significant, stated_parameters, worded
 from diffcloud.evaluation.methods import space_of
 from diffcloud.evaluation.summary import largest_sources
 from diffcloud.io.episodes import Episode
@@ -124,7 +124,7 @@ def findings_of(told: Told) -> list[str]:
             first = largest_sources(found.sources, name, 2)
             ends = f", {found.level:.0%} interval {digits(interval.low)} to {digits(interval.high)}"
             improve = f" (improve first: {first})" if first else ""
-        lines.append(f"{name}: {digits(entry['value'])} {entry['unit']}{ends}: {status.replace('_', ' ')}{improve}.")
+        lines.append(f"{name}: {digits(entry['value'])} {entry['unit']}{ends}: {worded(status)}{improve}.")
     if record.estimate is not None and record.estimate.grip_m is not None:
         lines.append(f"The grasp is {1e3 * record.estimate.grip_m:.0f} mm wide, as the fit found it.")
     return lines

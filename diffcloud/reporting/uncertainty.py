@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from diffcloud.evaluation.intervals import Intervals, significant
+from diffcloud.evaluation.intervals import Intervals, significant, worded
 from diffcloud.evaluation.summary import largest_sources
 from diffcloud.reporting.tables import Cell, Table, table
 
@@ -20,6 +20,6 @@ def _row(found: Intervals, name: str) -> list[Cell]:
         Cell(name),
         Cell(f"{digits(entry.value)} {entry.unit}", sort=entry.value),
         Cell(f"{digits(entry.low)} to {digits(entry.high)}"),
-        Cell(entry.status.replace("_", " ")),
+        Cell(worded(entry.status)),
         Cell(largest_sources(found.sources, name)),
     ]

@@ -226,10 +226,12 @@ def test_an_interrupted_training_goes_on(work):
 
 @pytest.mark.slow
 def test_several_networks_at_once_are_those_of_one_after_another(work):
-    both = (*TRAIN, "--model", "pointnet2", "--json")
-    alone = result(run(*both))
+    both = (*TRAIN, "--model", "pointnet2,mlp", "--json")
+    done = run(*both)
+    alone = result(done)
     written = {file.name: file.read_bytes() for file in (work / NETWORKS).glob("*.safetensors")}
     assert set(written) == {"mlp.safetensors", "pointnet2.safetensors"}
+    assert done.stderr.count("Training ") == 2  # a network that is named twice is trained once
     for file in (work / NETWORKS).glob("*/training.json"):
         file.unlink()
     together = result(run(*both, "--workers", 2))
