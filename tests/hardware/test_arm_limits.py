@@ -160,7 +160,7 @@ class TestPlan:
         folder = release.parent / "trajs"
         if not folder.is_dir():
             pytest.skip("the published trajectories (trajs/) are not beside DIFFCLOUD_RELEASE")
-        for name in ("lift", "fold", "stretching"):
+        for name in ("lift", "fold", "stretch"):
             path = read_trajectory(folder / f"{name}_traj.npy")
             held = checker()
             start = held.check_trajectory("approach", line(HOME_M, path.positions[0]), reading())

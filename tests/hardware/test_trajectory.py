@@ -146,7 +146,7 @@ def test_published_trajectories_keep_the_limits_at_their_own_speed(release):
     folder = release.parent / "trajs"
     if not folder.is_dir():
         pytest.skip("the published trajectories (trajs/) are not beside DIFFCLOUD_RELEASE")
-    for name in ("lift", "fold", "stretching"):
+    for name in ("lift", "fold", "stretch"):
         path = read_trajectory(folder / f"{name}_traj.npy")
         check_trajectory(path, FAST)
         with pytest.raises(LimitError, match="time_scale"):
