@@ -29,7 +29,15 @@ from diffcloud.estimation.solvers import Progress
 from diffcloud.estimation.task import FitTask, Recording, compared
 from diffcloud.evaluation.intervals import Intervals, draws, intervals_of, stated_parameters, worded
 from diffcloud.evaluation.methods import space_of
-from diffcloud.identification import fit_settings, found_cloth, known_grip, with_density, with_material_path
+from diffcloud.identification import (
+    find_hanging,
+    fit_settings,
+    found_cloth,
+    known_grip,
+    prepared,
+    with_density,
+    with_material_path,
+)
 from diffcloud.io.episodes import Episode, read_episode
 from diffcloud.io.files import read_yaml, together, write_json, write_text
 from diffcloud.io.imports import cloud_folder
@@ -225,7 +233,7 @@ def find_scenes(
     density: float | tuple[float, float] | None = None,
     grip: float | None = None,
 ) -> list[Scene]:
-    """A scene for each recording of one rectangular cloth that lies flat at first and is held by one corner or more.
+    """A scene for each recording of one rectangular cloth, which lies flat at first or hangs from the gripper.
 
     Args:
         size: sides [m]; by default as the first frames show them.
@@ -239,13 +247,18 @@ def find_scenes(
     fields = found_cloth(recordings, size, None if weighed is None else weighed[0])
     cloth: dict[str, Any] = {name: found.value for name, found in fields.items()}
     if grip is not None:
-        cloth |= known_grip(grip)
+        cloth |= {"grip_m": grip} if cloth["base"] == "hang" else known_grip(grip)
     if weighed is not None and weighed[1]:
         cloth = with_density(cloth, *weighed)
     scenes = list[Scene]()
     sides = (float(cloth["size_m"][0]), float(cloth["size_m"][1]))
     for number, recording in enumerate(recordings, 1):
-        layout = find_layout(recording, sides, float(cloth["grip_m"]))
+        if cloth["base"] == "hang":
+            recording, stamps = prepared(recording)
+            layout = find_hanging(recording, cloth)
+            layout = replace(layout, warnings=(*filter(None, [stamps]), *layout.warnings))
+        else:
+            layout = find_layout(recording, sides, float(cloth["grip_m"]))
         for message in layout.warnings:
             warnings.warn(f"Recording {number}: {message}.", stacklevel=2)
         options = {**cloth, **{name: found.value for name, found in layout.fields.items()}}
@@ -281,7 +294,7 @@ def fit(
     if len(set(names)) < len(names):
         raise ConfigError(f"Two scenes are named {max(names, key=names.count)}; give each a name of its own.")
     pairs = zip(chosen, episodes, strict=True)
-    members = [Recording(scene.scenario, scene.name, episode) for scene, episode in pairs]
+    members = [Recording(scene.scenario, scene.name, _as_fitted(scene, episode)) for scene, episode in pairs]
     settings = settings or chosen[0].settings
     result = FitTask(members, settings).fitted(
         progress, None if progress is None else lambda done, doing, told: progress(told)
@@ -303,6 +316,11 @@ def fit(
         intervals=intervals,
         motions=tuple(result.motions),
     )
+
+
+def _as_fitted(scene: Scene, episode: Episode) -> Episode:
+    """The recording in the form in which fits of this scene take it."""
+    return prepared(episode)[0] if scene.options.get("base") == "hang" else episode
 
 
 def _estimates(record: FitRecord, intervals: Intervals | None, scenario: Scenario, level: float) -> dict[str, Estimate]:
@@ -347,7 +365,7 @@ def report(fit: Fit, recordings: Episode | Sequence[Episode], path: str | Path) 
     if len(episodes) != len(fit.scenes):
         raise ConfigError(f"The fit is of {len(fit.scenes)} recordings, got {len(episodes)}.")
     pairs = zip(fit.scenes, episodes, strict=True)
-    members = [Recording(scene.scenario, scene.name, episode) for scene, episode in pairs]
+    members = [Recording(scene.scenario, scene.name, _as_fitted(scene, episode)) for scene, episode in pairs]
     status = Status.interrupted if fit.status == "interrupted" else Status.finished
     told = Told(fit.record, compared(fit.record, members), fit.intervals, status)
     page = page_of(told, findings_of(told), {one.name: one.episode for one in members}, fit.motions)

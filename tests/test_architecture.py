@@ -25,7 +25,7 @@ ALLOWED = {
     "estimation": {"mesh", "io", "sim", "scene", "clouds"},
     "regressors": {"mesh", "io", "clouds"},
     "evaluation": {"mesh", "io", "sim", "scene", "clouds", "estimation"},
-    "identification": {"mesh", "io", "sim", "scene", "estimation"},
+    "identification": {"mesh", "io", "sim", "scene", "clouds", "estimation"},
     "simulators": {"mesh", "io", "sim", "scene", "arcsim", "estimation"},
     "sensing": {"mesh", "io", "clouds"},
     "hardware": {"mesh", "io", "clouds", "sensing"},

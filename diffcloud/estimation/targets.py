@@ -291,6 +291,8 @@ def _found_cut(system: System, episode: Episode, unit: float) -> float | None:
     if planes and planes.keys() >= episode.viewpoints.keys() and all(plane[2] > 0 for plane in planes.values()):
         x, y, _ = system.mesh.nodes.mean(axis=0)
         return min(float(d - a * x - b * y) / float(c) for a, b, c, d in planes.values())
+    if not system.setup.surrounding.obstacles:  # points are cut off above a table, and there is none
+        return None
     low = float(np.quantile(episode.points[:, 2], _LOWEST))
     return low if low > system.mesh.nodes[:, 2].min() + _CUT_M / unit else None
 

@@ -1,5 +1,6 @@
 """From recordings of a cloth to its parameters: what is assumed where nobody says otherwise."""
 
+from diffcloud.identification.hanging import HANG_FIELDS, find_hanging, prepared
 from diffcloud.identification.protocol import (
     fit_settings,
     found_cloth,
@@ -8,4 +9,13 @@ from diffcloud.identification.protocol import (
     with_material_path,
 )
 
-__all__ = ["fit_settings", "found_cloth", "known_grip", "with_density", "with_material_path"]
+__all__ = [
+    "HANG_FIELDS",
+    "find_hanging",
+    "fit_settings",
+    "found_cloth",
+    "known_grip",
+    "prepared",
+    "with_density",
+    "with_material_path",
+]

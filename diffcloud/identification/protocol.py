@@ -8,8 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from diffcloud.errors import ConfigError
+from diffcloud.errors import ConfigError, EpisodeError
 from diffcloud.estimation.settings import FitSettings
+from diffcloud.identification.hanging import hanging_size, hangs
 from diffcloud.io.episodes import Episode
 from diffcloud.scene.scenarios import Scenario
 from diffcloud.scene.scenarios.layout import Found, found_size, node_counts
@@ -21,6 +22,16 @@ _AROUND = {"friction": 0.4, "compression": 0.5}
 _UNCERTAIN = {"friction": 2.0, "compression": 3.0, "shear": 1.2, "damping": 2.5}
 _BOUNDS = {"stretching": (0.03, 30.0), "bending": (0.03, 30.0), "density": (0.2, 5.0)}
 """Multiples of the nominal material."""
+_HANGING_UNCERTAIN = {
+    "compression": 3.0,
+    "shear": 1.2,
+    "damping": 2.5,
+    "added_mass": 1.5,
+    "linear_drag": 3.0,
+    "air_density": 2.0,
+}
+"""The air's are wide: the sheet swings through it, and theory for a flat plate is a guess."""
+_HANGING_NODES = 7
 _STEPS = 16
 _GRIP_KNOWN = 1.5
 
@@ -34,15 +45,33 @@ def found_cloth(
         size: sides [m]; by default as the first frames show them.
         density: weighed [kg/m²].
     """
+    hanging = [hangs(episode) for episode in episodes]
+    if any(hanging) and not all(hanging):
+        raise EpisodeError(
+            "In some recordings the cloth hangs at the start, in others it lies flat. Fit those that hang and those "
+            "that lie in two commands, with two folders for --out."
+        )
     reason = "as stated"
     if size is None:
-        sides = np.array([found_size(episode) for episode in episodes])
+        sides = np.array([hanging_size(episode) if all(hanging) else found_size(episode) for episode in episodes])
         size = tuple(np.round(np.median(sides, axis=0), 3).tolist())
         reason = "rectangle around the first frames" + (
             f"; recordings differ by up to {np.ptp(sides, axis=0).max():.3f} m" if len(sides) > 1 else ""
         )
     told = "as weighed" if density is not None else "usual for a knit; fitted"
     material = {"density_kg_m2": density or _DENSITY, **_MATERIAL}
+    if all(hanging):
+        nodes = [max(round((_HANGING_NODES - 1) * side / max(size)) + 1, 4) for side in size]
+        return {
+            "base": Found("hang", "a rectangular cloth that hangs from the gripper"),
+            "size_m": Found(list(size), reason),
+            "nodes": Found(nodes, f"{_HANGING_NODES} along the longer side: a hanging cloth bends little"),
+            "grip_m": Found(GRIP_M, "size of the grasp at a corner; measure your gripper's [m]"),
+            "air": Found("still", "air moves with a hanging cloth; none for simulators without air"),
+            "material": Found(material, f"nominal material; density {told}"),
+            "compression": Found(_AROUND["compression"], "usual; fitted too, within `uncertain`"),
+            "uncertain": Found(_HANGING_UNCERTAIN, "priors of what is fitted too: factors of one standard deviation"),
+        }
     return {
         "base": Found("lift", "a rectangular cloth on a table"),
         "size_m": Found(list(size), reason),

@@ -20,10 +20,11 @@ from diffcloud.io.ply import read_ply
 
 
 def read_cloud(path: Path) -> NDArray[np.float32]:
-    """[N, 3] points of one file; colours, normals and further columns are left out.
+    """[N, 3] points of one file. Colours, normals and further columns are left out, and so are points that are NaN or
+    infinite, which stand for pixels without depth.
 
     Raises:
-        EpisodeError: missing, damaged, empty (`EmptyCloudError`), of the wrong shape, or with NaN/Inf points.
+        EpisodeError: missing, damaged, without any point (`EmptyCloudError`), or of the wrong shape.
     """
     path = Path(path)
     check_input(path, kind="cloud", error=EpisodeError)
@@ -34,11 +35,9 @@ def read_cloud(path: Path) -> NDArray[np.float32]:
         raise EpisodeError(f"{path} holds {points.dtype} values; a cloud holds numbers.")
     if points.ndim != 2 or points.shape[1] != 3:
         raise EpisodeError(f"{path} has shape {list(points.shape)}; a cloud has shape [points, 3].")
+    points = points[np.isfinite(points).all(axis=1)]
     if len(points) == 0:
         raise EmptyCloudError(f"{path} is an empty cloud.")
-    if not np.isfinite(points).all():
-        count = int((~np.isfinite(points).all(axis=1)).sum())
-        raise EpisodeError(f"{path} holds {count} NaN or infinite points; remove them first.")
     return points.astype(np.float32)
 
 

@@ -16,6 +16,8 @@ from diffcloud.io.tables import numbers, read_csv
 _AXES = ["x", "y", "z"]
 _FARTHEST_M = 20.0
 _SAME_TIME_S = 1e-4
+_BEYOND_S = 0.2
+"""By how much clouds may begin before a track of another rate, or end after it: the gripper stands still there."""
 
 
 @dataclass(frozen=True)
@@ -30,13 +32,15 @@ class GripperTracks:
     """[T] since the first [s]; None where the files have no t_s."""
 
 
-def read_tracks(files: Mapping[str, Path], frames: int) -> GripperTracks:
+def read_tracks(files: Mapping[str, Path], frames: int, stamps: NDArray[np.float64] | None = None) -> GripperTracks:
     """The tracks of one or several grippers.
 
     Args:
-        files: name -> CSV with columns x, y, z [m] and optionally t_s [s], one row a frame. A single one may hold several
-            grippers: with a column `gripper` that names them, one row a frame and gripper. These names replace its own.
+        files: name -> CSV with columns x, y, z [m] and optionally t_s [s], one row a frame. With t_s and `stamps`, rows may
+            have another rate; then positions are interpolated. A single file may hold several grippers: with a column
+            `gripper` that names them. These names replace its own.
         frames: T.
+        stamps: [T] times of the clouds, on the clock of t_s [s].
 
     Raises:
         EpisodeError: an unreadable file, missing columns or rows, positions in other units, or times that differ.
@@ -55,18 +59,45 @@ def read_tracks(files: Mapping[str, Path], frames: int) -> GripperTracks:
     for name, table in tables.items():
         place = str(files[name]) if len(tables) == 1 else f"{files[name]}, gripper {name!r}"
         track = numbers(table, _AXES, place=place, error=EpisodeError)
+        own = numbers(table, ["t_s"], place=place, error=EpisodeError)[:, 0] if "t_s" in table.columns else None
         if len(track) != frames:
-            raise EpisodeError(f"{place} has {len(track)} rows for {frames} clouds; give one row a frame.")
+            track, own = _interpolated(track, own, frames, stamps, place), stamps
         extent = float(np.ptp(track, axis=0).max())
         if extent > _FARTHEST_M:
             raise EpisodeError(f"{place}: the gripper moves by {extent:.0f}; positions are metres, not millimetres.")
         positions.append(track)
-        if "t_s" in table.columns:
-            own = numbers(table, ["t_s"], place=place, error=EpisodeError)[:, 0]
+        if own is not None:
             if times is not None and np.abs(own - times).max() > _SAME_TIME_S:
                 raise EpisodeError(f"{place}: its times differ from those of the other grippers; give one row a frame.")
             times = own
     return GripperTracks(tuple(tables), np.stack(positions, axis=1), None if times is None else times - times[0])
+
+
+def _interpolated(
+    track: NDArray[np.float64],
+    times: NDArray[np.float64] | None,
+    frames: int,
+    stamps: NDArray[np.float64] | None,
+    place: str,
+) -> NDArray[np.float64]:
+    """[frames, 3] a track of another rate at the times of the clouds.
+
+    Raises:
+        EpisodeError: times that are unknown, that do not increase, or that do not cover the clouds.
+    """
+    if times is None or stamps is None:
+        raise EpisodeError(
+            f"{place} has {len(track)} rows for {frames} clouds. Give one row a frame, or a column t_s and clouds whose "
+            "names are times on the same clock."
+        )
+    if (np.diff(times) < 0).any():
+        raise EpisodeError(f"{place}: t_s decreases after row {int(np.argmax(np.diff(times) < 0))}; sort the rows by time.")
+    if stamps[0] < times[0] - _BEYOND_S or stamps[-1] > times[-1] + _BEYOND_S:
+        raise EpisodeError(
+            f"{place} covers {times[0]:.3f} to {times[-1]:.3f} s, and the clouds {stamps[0]:.3f} to {stamps[-1]:.3f} s. "
+            f"Clouds may lie at most {_BEYOND_S:g} s beyond the track. Give both on one clock, and leave out other clouds."
+        )
+    return np.stack([np.interp(stamps, times, column) for column in track.T], axis=1)
 
 
 def named_files(given: list[str]) -> dict[str, Path]:

@@ -109,7 +109,8 @@ def cloud_folder(
             "points of the cloth: lower the height below which points were cut off, or leave these frames out and renumber "
             "the others."
         )
-    tracks = read_tracks(grippers, len(frames)) if grippers else None
+    stamps = named.times if named.times is not None or rate_hz is None else np.arange(len(frames)) / rate_hz
+    tracks = read_tracks(grippers, len(frames), stamps) if grippers else None
     times = _times(named, None if tracks is None else tracks.times, rate_hz, Path(folder))
     about = {"source": "clouds", **(meta or {})}
     if tracks is None:

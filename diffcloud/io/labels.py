@@ -14,7 +14,7 @@ _KNOWN = frozenset({"scenario", "fabric", "category"})
 """Fields of episode.json that are labels: the tables of an evaluation and the stages of the pipeline read them."""
 _TAKEN = (frozenset(EpisodeFile.model_fields) - _KNOWN) | {
     "trajectory", "viewpoints", "pinholes", "cut_planes", "clocks", "scale_sigma", "pose_sigmas", "quality", "agreement",
-    "set_up", "predictions", "noise_free", "category_assumed",
+    "set_up", "rest_s", "predictions", "noise_free", "category_assumed",
 }  # fmt: skip
 """Names of facts that commands write and fits read: a label would be taken for the fact."""
 

@@ -11,7 +11,7 @@ import yaml
 
 from diffcloud.console import warn
 from diffcloud.errors import ConfigError, DiffCloudError, EpisodeError
-from diffcloud.identification import found_cloth, with_material_path
+from diffcloud.identification import HANG_FIELDS, find_hanging, found_cloth, prepared, with_material_path
 from diffcloud.io.episodes import Episode, read_episode, write_episode
 from diffcloud.io.files import files_in, read_json, read_yaml, together, write_json, write_text
 from diffcloud.io.fingerprints import fingerprint
@@ -25,7 +25,8 @@ from diffcloud.scene.scenarios.catalogue import make_scenario, own_options
 from diffcloud.scene.scenarios.layout import FIELDS, Found, find_layout
 
 _BAGS = (".bag", ".mcap", ".db3")
-_CLOTH_FIELDS = ("base", "size_m", "nodes", "material", "grip", "grip_m", "steps_per_frame")
+_CLOTH_FIELDS = ("base", "size_m", "nodes", "material", "grip_m")
+_FLAT_FIELDS = (*_CLOTH_FIELDS, "grip", "steps_per_frame")
 _HEAD = "# Found by diffcloud fit, with the reason beside each value. Edit and run the command again to overrule."
 
 
@@ -53,10 +54,21 @@ def find_scene(
     path = out / "recordings.yaml"
     with together():  # nothing of a scene that was not found would count in the next run
         cloth = _cloth(out, episodes, size, mass)
+        if cloth["base"] == "hang":
+            episodes = {name: _prepared(name, episode, out) for name, episode in episodes.items()}
         stated = read_fields(path).keys() if path.is_file() else set[str]()
         layouts = _layouts(out, episodes, names, cloth)
         _warn_of_changes(out, episodes, stated)
     return episodes, cloth, layouts
+
+
+def _prepared(name: str, episode: Episode, out: Path) -> Episode:
+    """The recording of a hanging cloth as fits take it, kept in OUT/episodes/ too."""
+    found, sentence = prepared(episode)
+    if sentence:
+        warn(f"{name}: {sentence}.")
+    write_episode(out / "episodes" / f"{name}.npz", found)
+    return found
 
 
 def read_all(names: Mapping[str, Path], out: Path, topics: Sequence[str] = (), *, keep: bool = True) -> dict[str, Episode]:
@@ -149,7 +161,7 @@ def _cloth(
     path = out / "cloth.yaml"
     if path.is_file():
         fields = read_fields(path)
-        _refuse_missing(fields, _CLOTH_FIELDS, str(path))
+        _refuse_missing(fields, _CLOTH_FIELDS if fields.get("base") == "hang" else _FLAT_FIELDS, str(path))
         own_options(fields, "cloth", path, folder=out)
         if stated is not None and list(stated) != fields["size_m"]:
             other = f"--size {stated[0]:g}x{stated[1]:g}"
@@ -166,14 +178,14 @@ def _layouts(
     """The fields of each recording in recordings.yaml: read where they are there, else found and written."""
     path = out / "recordings.yaml"
     known = read_fields(path) if path.is_file() else {}
-    size = (float(cloth["size_m"][0]), float(cloth["size_m"][1]))
+    size, hangs = (float(cloth["size_m"][0]), float(cloth["size_m"][1])), cloth["base"] == "hang"
     blocks, layouts = [path.read_text().rstrip()] if known else [_HEAD], {}
     for name, episode in episodes.items():
         if name in known:
             if not isinstance(known[name], dict):
                 raise ConfigError(f"{path}: {name} must be a mapping of a scenario's fields, got {known[name]!r:.60}.")
             layouts[name] = dict(known[name])
-            _refuse_missing(layouts[name], FIELDS, f"{path}: {name}")
+            _refuse_missing(layouts[name], HANG_FIELDS if hangs else FIELDS, f"{path}: {name}")
             where = f"{out / 'cloth.yaml'} with {name} of {path}"
             options = own_options({**cloth, **layouts[name]}, name, where, folder=out)
             try:
@@ -182,7 +194,10 @@ def _layouts(
                 raise ConfigError(f"{where}: {error}") from error
             continue
         try:
-            layout = find_layout(episode, size, 0.0 if cloth["grip"] == "pivot" else cloth["grip_m"])
+            if hangs:
+                layout = find_hanging(episode, cloth)
+            else:
+                layout = find_layout(episode, size, 0.0 if cloth["grip"] == "pivot" else cloth["grip_m"])
         except EpisodeError as error:
             raise EpisodeError(f"{sources[name]}: {error}") from error
         for message in layout.warnings:

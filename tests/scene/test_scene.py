@@ -18,9 +18,9 @@ from tests.sim.contact.penetration import find_penetrations, minimal_distance
 
 class TestScenarios:
     def test_names(self):
-        assert SCENARIO_NAMES[:5] == ("lift", "fold", "band_stretch", "vest_hang", "shake")
-        assert SCENARIO_NAMES[5:7] == ("recorded_lift", "recorded_fold")
-        assert SCENARIO_NAMES[7:] == ("release_lift", "release_fold", "release_hang", "release_band")
+        assert SCENARIO_NAMES[:6] == ("lift", "fold", "band_stretch", "vest_hang", "shake", "hang")
+        assert SCENARIO_NAMES[6:8] == ("recorded_lift", "recorded_fold")
+        assert SCENARIO_NAMES[8:] == ("release_lift", "release_fold", "release_hang", "release_band")
         with pytest.raises(ConfigError, match=r"Unknown scenario 'lfit'. Did you mean 'lift'.* Allowed: .*lift"):
             load_scenario("lfit")
         with pytest.raises(ConfigError, match="needs the published scene file"):

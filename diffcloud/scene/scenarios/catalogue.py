@@ -14,13 +14,14 @@ from diffcloud.io.schema import explain
 from diffcloud.scene.registry import EXPERIMENTS, load_experiment, load_scene
 from diffcloud.scene.scenarios.band import BAND_STRETCH, BandScenario, band_scenario
 from diffcloud.scene.scenarios.grid import FOLD, LIFT, SHAKE, GridScenario, grid_scenario
+from diffcloud.scene.scenarios.hang import HANG, HangScenario, hang_scenario
 from diffcloud.scene.scenarios.recorded import RECORDED
 from diffcloud.scene.scenarios.scenario import Scenario
 from diffcloud.scene.scenarios.vest import VEST_HANG, VestScenario, vest_scenario
 
-Options = GridScenario | BandScenario | VestScenario
+Options = GridScenario | HangScenario | BandScenario | VestScenario
 
-_ALL: tuple[Options, ...] = (LIFT, FOLD, BAND_STRETCH, VEST_HANG, SHAKE, *RECORDED)
+_ALL: tuple[Options, ...] = (LIFT, FOLD, BAND_STRETCH, VEST_HANG, SHAKE, HANG, *RECORDED)
 _BUILT_IN: dict[str, Options] = {options.name: options for options in _ALL}
 SCENARIO_NAMES = (*_BUILT_IN, *EXPERIMENTS)
 
@@ -69,6 +70,8 @@ def make_scenario(options: Options) -> Scenario:
     match options:
         case GridScenario():
             return grid_scenario(options)
+        case HangScenario():
+            return hang_scenario(options)
         case BandScenario():
             return band_scenario(options)
         case VestScenario():
@@ -77,6 +80,8 @@ def make_scenario(options: Options) -> Scenario:
 
 @overload
 def built_in(name: Literal["lift", "fold", "shake", "recorded_lift", "recorded_fold"]) -> GridScenario: ...
+@overload
+def built_in(name: Literal["hang"]) -> HangScenario: ...
 @overload
 def built_in(name: Literal["band_stretch"]) -> BandScenario: ...
 @overload

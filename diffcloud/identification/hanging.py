@@ -1,0 +1,276 @@
+"""How a recorded cloth hangs at its start, found by hypotheses: each is simulated until it hangs still and compared.
+
+A cloth may hang from a whole side, from the two corners of a side, taut or slack, or from one corner. The hypothesis whose
+cloth is nearest to the first cloud wins. A side and its two corners often look alike at rest. Then the recorded motion
+decides, and where it does not either, the side.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from diffcloud.clouds.surface import NO_GUESS, find_on_surface
+from diffcloud.errors import DivergedError, EpisodeError, SceneError
+from diffcloud.estimation.targets import track_displacement
+from diffcloud.io.episodes import Episode
+from diffcloud.io.stamps import corrected_stamps
+from diffcloud.scene.scenarios.catalogue import own_options
+from diffcloud.scene.scenarios.hang import HangScenario, hang_scenario
+from diffcloud.scene.scenarios.layout import Found, Layout
+from diffcloud.sim.simulate import rollout
+
+Floats = NDArray[np.float64]
+
+HANG_FIELDS = ("held", "side", "rim_m", "yaw_deg", "span", "rate_hz", "frames", "steps_per_frame", "path")
+"""Of a scenario, those that `find_hanging` finds."""
+_STILL_M = 0.005
+"""A gripper that has moved less stands still."""
+_FIRST_FRAMES, _FIRST_POINTS = 10, 3000
+_UPRIGHT = 0.4
+"""Height of a hanging cloud over its extent in the horizontal, at least."""
+_RIM = 0.12
+"""Part of the height in which the points of the held side lie."""
+_EDGE = 0.01
+"""Part of the points beyond each side: noise."""
+_TAUT = 0.96
+"""A span above is taken as taut."""
+_CAP_M, _WORST_M = 0.05, 0.025
+"""Of one distance; and of the RMS distance of a hypothesis that can be right."""
+_TIE, _SAME = 1.25, 1.1
+"""Factors within which hypotheses count as equal: at rest, and in motion."""
+_MOTION_FRAMES, _MOTION_S = 15, 3.0
+_ALIGNING = 8
+"""Rounds in which a settled cloth is moved and turned onto the cloud."""
+_FAR_M, _NEAR_M = 0.25, 0.03
+"""Distances of the held side from the gripper: refused, and warned of."""
+_LONGEST_STEP_S = 0.02
+"""A hanging cloth without contact moves smoothly: longer steps would damp its swing."""
+_REST_S = 1.0
+"""Before the first cloud, in which the cloth comes to rest with the parameters of a fit: its start is that of the nominal
+material."""
+_PREPARED = "rest_s"
+"""Of an episode's meta: this time was added."""
+_SIGMAS = {"x": 0.01, "y": 0.01, "z": 0.01, "yaw": 0.1, "tilt_x": 0.035, "tilt_y": 0.035}
+"""Standard deviations of the place of the held part and of the cameras' frame against gravity [m, rad]."""
+_LAG_S = (0.05, 0.01)
+"""Standard deviation of the lag that all clouds share [s], and where their stamps were corrected."""
+
+
+@dataclass(frozen=True)
+class _Hypothesis:
+    """One way to hang, its settled cloth, and how far the first cloud is from it."""
+
+    options: HangScenario
+    rms_m: float
+
+    @property
+    def words(self) -> str:
+        name = {"edge": "side", "corners": "two corners", "corner": "corner"}[self.options.held]
+        slack = f", span {self.options.span:.2f}" if self.options.span < 1 else ""
+        return f"{name} ({self.options.side}{slack}) {1e3 * self.rms_m:.0f} mm"
+
+
+def hangs(episode: Episode) -> bool:
+    """Whether the first cloud is upright and below the gripper."""
+    if episode.gripper is None:
+        return False
+    cloud = _first_cloud(episode)
+    low, high = np.quantile(cloud, [_EDGE, 1 - _EDGE], axis=0)
+    wide = float(np.linalg.norm((high - low)[:2]))
+    return bool(high[2] - low[2] > _UPRIGHT * wide and episode.gripper[0, 0, 2] > np.median(cloud[:, 2]))
+
+
+def hanging_size(episode: Episode) -> tuple[float, float]:
+    """Extents of the first cloud [m], the longer one first: sides of a cloth that hangs from one of its sides."""
+    cloud = _first_cloud(episode)
+    along, _ = _axes(cloud)
+    sides = [float(np.ptp(np.quantile(values, [_EDGE, 1 - _EDGE]))) for values in (cloud @ along, cloud[:, 2])]
+    return max(sides), min(sides)
+
+
+def prepared(episode: Episode) -> tuple[Episode, str]:
+    """A recording of a hanging cloth as fits take it: stamps corrected, time to come to rest, and priors of its pose.
+
+    A recording that is prepared already stays as it is.
+
+    Returns:
+        The episode, and a sentence on its stamps; empty where they are right.
+    """
+    if _PREPARED in episode.meta:
+        return episode, ""
+    found, lags = corrected_stamps(episode)
+    sigmas = {**_SIGMAS, "lag": _LAG_S[lags is not None], **episode.pose_sigmas}
+    found = replace(found, times=found.times + _REST_S, meta={**found.meta, "pose_sigmas": sigmas, _PREPARED: _REST_S})
+    return found, "" if lags is None else lags.sentence
+
+
+def find_hanging(episode: Episode, cloth: Mapping[str, Any]) -> Layout:
+    """How the cloth of a recording hangs at its start.
+
+    Args:
+        episode: in metres, z up, with the track of one gripper.
+        cloth: fields of a `hang` scenario that all recordings share, such as its size and material.
+
+    Raises:
+        EpisodeError: no way to hang is within 25 mm of the first cloud, or the gripper is elsewhere; gives all distances.
+    """
+    assert episode.gripper is not None
+    cloud, gripper = _first_cloud(episode), episode.gripper[:, 0]
+    interval = float(np.median(np.diff(episode.times))) if episode.frame_count > 1 else 0.1
+    shared = {
+        "rate_hz": Found(round(1 / interval, 6), f"frames are {interval:.4f} s apart"),
+        "frames": Found(
+            max(math.ceil(float(episode.times[-1]) / interval), 1), f"the recording ends at {episode.times[-1]:.3f} s"
+        ),
+        "steps_per_frame": Found(max(math.ceil(interval / _LONGEST_STEP_S), 1), "steps of at most 20 ms"),
+        "path": Found(
+            [[0.0, 0.0, 0.0, 0.0], [float(episode.times[-1]), *(round(float(x), 4) for x in gripper[-1] - gripper[0])]],
+            "first and last position of the gripper; fits follow its recorded track",
+        ),
+    }
+    base = {**cloth, **{name: one.value for name, one in shared.items()}}
+    tried: list[_Hypothesis] = []
+    for fields in _ways(cloud, tuple(cloth["size_m"])):
+        options = own_options({**base, **fields}, "hang", "the cloth", folder=Path())
+        assert isinstance(options, HangScenario)
+        try:
+            tried.append(_aligned(options, cloud))
+        except SceneError:  # it does not come to rest
+            continue
+    tried.sort(key=lambda one: one.rms_m)
+    scores = "; ".join(one.words for one in tried)
+    if not tried or tried[0].rms_m > _WORST_M:
+        raise EpisodeError(
+            f"The first cloud is not that of a cloth of {' x '.join(f'{x:g}' for x in cloth['size_m'])} m that hangs at "
+            f"rest. RMS distances: {scores}; at most {1e3 * _WORST_M:.0f} mm are allowed. Check --size, that clouds and "
+            "gripper are in metres in one frame with z up, and that the cloud shows the whole cloth and nothing else."
+        )
+    ties = [one for one in tried if one.rms_m < _TIE * tried[0].rms_m]
+    best, reason = _by_motion(ties, episode) if len(ties) > 1 else (ties[0], "nearest to the first cloud")
+    chosen = best.options
+    away = float(np.linalg.norm(np.array(chosen.rim_m) - gripper[0]))
+    if away > _FAR_M:
+        raise EpisodeError(
+            f"The held part of the cloth is {away:.2f} m from the gripper; at most {_FAR_M:g} m are allowed. Clouds and "
+            "gripper must be in one frame, in metres, z up."
+        )
+    warnings = []
+    if away > _NEAR_M:
+        warnings.append(
+            f"the held part of the cloth is {1e3 * away:.0f} mm from the gripper; it follows the gripper without turning"
+        )
+    found = {
+        "held": Found(chosen.held, f"{reason}: {scores}"),
+        "side": Found(chosen.side, "the held side, along the cloth's own x or y"),
+        "rim_m": Found([round(x, 4) for x in chosen.rim_m], "where the settled cloth is nearest to the first cloud"),
+        "yaw_deg": Found(round(chosen.yaw_deg % 360, 2), "likewise"),
+        "span": Found(round(chosen.span, 3), "distance of the held corners over the length of their side"),
+        **shared,
+    }
+    return Layout(found, tuple(warnings))
+
+
+def _first_cloud(episode: Episode) -> Floats:
+    """[N, 3] points of the frames before the gripper moves."""
+    assert episode.gripper is not None
+    way = np.linalg.norm(episode.gripper[:, 0] - episode.gripper[0, 0], axis=1)
+    still = int(np.argmax(way > _STILL_M)) if (way > _STILL_M).any() else episode.frame_count
+    points = np.concatenate([episode.frame(frame) for frame in range(min(max(still, 1), _FIRST_FRAMES))])
+    return points[:: max(len(points) // _FIRST_POINTS, 1)].astype(np.float64)
+
+
+def _axes(cloud: Floats) -> tuple[Floats, Floats]:
+    """The horizontal direction along which a cloud is longest, and the one across it; [3] each."""
+    level = cloud[:, :2] - cloud[:, :2].mean(axis=0)
+    x, y = np.linalg.eigh(level.T @ level)[1][:, -1]
+    return np.array([x, y, 0.0]), np.array([-y, x, 0.0])
+
+
+def _ways(cloud: Floats, size: tuple[float, float]) -> list[dict[str, Any]]:
+    """Fields of each way to hang."""
+    along, normal = _axes(cloud)
+    yaw = math.degrees(math.atan2(along[1], along[0]))
+    low, top = np.quantile(cloud[:, 2], [_EDGE, 1 - _EDGE])
+    rim = cloud[cloud[:, 2] > top - _RIM * (top - low)]
+    left, right = np.quantile(rim @ along, [_EDGE, 1 - _EDGE])
+    middle = 0.5 * (left + right) * along + float(np.median(rim @ normal)) * normal + [0.0, 0.0, top]
+    highest = cloud[cloud[:, 2].argsort()[-max(len(cloud) // 100, 1) :]].mean(axis=0)
+    ways: list[dict[str, Any]] = []
+    for side, length in zip("xy", size, strict=True):
+        if side == "y" and math.isclose(*size, rel_tol=0.02):
+            break  # a square looks the same from both sides
+        straight = {"side": side, "rim_m": middle.tolist(), "yaw_deg": yaw}
+        ways += [{"held": held, **straight} for held in ("edge", "corners")]
+        for span in {round(s, 3) for s in (0.8, 0.9, (right - left) / length) if 0.35 < s < _TAUT}:
+            ways += [{"held": "corners", **straight, "span": span, "yaw_deg": yaw + turn} for turn in (0.0, 180.0)]
+    return [*ways, *({"held": "corner", "rim_m": highest.tolist(), "yaw_deg": yaw + turn} for turn in (0.0, 180.0))]
+
+
+def _aligned(options: HangScenario, cloud: Floats) -> _Hypothesis:
+    """The hypothesis moved and turned about the vertical so that its settled cloth is nearest to the cloud."""
+    scene = hang_scenario(options).scene
+    nodes, faces, rim = scene.mesh.nodes, scene.mesh.faces, np.array(options.rim_m)
+    turned = 0.0
+    for _ in range(_ALIGNING):
+        place = _on_surface(cloud, nodes, faces)
+        near = np.linalg.norm(cloud - place, axis=1) < _CAP_M
+        if near.sum() < 3:
+            break
+        a, b = place[near], cloud[near]
+        level_a, level_b = (part[:, :2] - part[:, :2].mean(axis=0) for part in (a, b))
+        angle = math.atan2(
+            float((level_a[:, 0] * level_b[:, 1] - level_a[:, 1] * level_b[:, 0]).sum()), float((level_a * level_b).sum())
+        )
+        cosine, sine = math.cos(angle), math.sin(angle)
+        turn = np.array([[cosine, sine, 0.0], [-sine, cosine, 0.0], [0.0, 0.0, 1.0]])  # for row vectors
+        shift = b.mean(axis=0) - a.mean(axis=0) @ turn
+        nodes, rim, turned = nodes @ turn + shift, rim @ turn + shift, turned + angle
+    forth = np.linalg.norm(cloud - _on_surface(cloud, nodes, faces), axis=1)
+    back = cKDTree(cloud).query(nodes[faces].mean(axis=1))[0]
+    rms = math.sqrt(0.5 * sum(float((np.minimum(one, _CAP_M) ** 2).mean()) for one in (forth, back)))
+    x, y, z = rim.tolist()
+    placed = {"rim_m": (x, y, z), "yaw_deg": (options.yaw_deg + math.degrees(turned)) % 360}
+    return _Hypothesis(options.model_copy(update=placed), rms)
+
+
+def _on_surface(points: Floats, nodes: Floats, faces: NDArray[np.int64]) -> Floats:
+    """[N, 3] the nearest place of a mesh to each point."""
+    found, weights = find_on_surface(points[None], NO_GUESS, np.ascontiguousarray(nodes)[None], faces)
+    return np.asarray((nodes[faces[found[0]]] * weights[0][..., None]).sum(axis=1))
+
+
+def _by_motion(ties: list[_Hypothesis], episode: Episode) -> tuple[_Hypothesis, str]:
+    """The hypothesis that moves most like the recording; of those that move alike, the one with the most held nodes."""
+    first = float(episode.times[0])
+    frames = [int(f) for f in np.flatnonzero(episode.times <= first + _MOTION_S)]
+    frames = frames[:: max(len(frames) // _MOTION_FRAMES, 1)]
+    scores = []
+    for one in ties:
+        scenario = hang_scenario(one.options)
+        system, _ = scenario.scene.build()
+        steps = math.ceil(float(episode.times[frames[-1]]) / system.time_step)
+        track = torch.as_tensor(track_displacement(episode, system.handles.grippers, steps, system.time_step))[None]
+        try:
+            with torch.no_grad():
+                run = rollout(system, steps, track=track).at(torch.as_tensor(episode.times[frames]))[0].numpy()
+        except DivergedError:
+            scores.append(math.inf)
+            continue
+        squares = []
+        for nodes, frame in zip(run, frames, strict=True):
+            points = episode.frame(frame).astype(np.float64)
+            squares.append(float(((points - _on_surface(points, nodes, system.mesh.faces)) ** 2).sum(axis=1).mean()))
+        scores.append(math.sqrt(float(np.mean(squares))))
+    alike = [one for one, score in zip(ties, scores, strict=True) if score <= _SAME * min(scores)]
+    order = {"edge": 0, "corners": 1, "corner": 2}
+    chosen = min(alike, key=lambda one: (order[one.options.held], one.rms_m))
+    return chosen, "nearest to the first cloud" if len(alike) > 1 else "nearest to the motion"

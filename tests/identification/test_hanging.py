@@ -1,0 +1,183 @@
+"""Cloths that hang at the start: the start is found, late stamps are corrected, and the command fits them."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from diffcloud.errors import EpisodeError, SceneError
+from diffcloud.identification import find_hanging, found_cloth, prepared
+from diffcloud.identification.hanging import hanging_size, hangs
+from diffcloud.io.episodes import Episode
+from diffcloud.io.stamps import corrected_stamps
+from diffcloud.scene.scenarios import built_in
+from diffcloud.scene.scenarios.hang import HangScenario, hang_scenario
+from diffcloud.sim.simulate import rollout
+from tests.cli.invoke import invoke
+
+MATERIAL = {"density_kg_m2": 0.2, "stretching_n_m": 80.0, "bending_n_m": 1e-5, "poisson": 0.2, "damping_s": 0.002}
+PATH = [
+    (0, 0, 0, 0),
+    (0.6, 0, 0, 0),
+    (0.9, 0, 0.15, 0),
+    (1.5, 0, -0.15, 0),
+    (2.1, 0, 0.1, 0),
+    (2.5, 0, 0, 0),
+    (3.5, 0, 0, 0),
+]
+
+
+def options(**fields) -> HangScenario:
+    """A cloth of the truth: finer than the meshes of fits."""
+    told = {"size_m": (0.30, 0.24), "nodes": (13, 11), "material": MATERIAL, "path": PATH, "frames": 35, "yaw_deg": 20.0}
+    return HangScenario.model_validate({**built_in("hang").model_dump(), "rate_hz": 10.0, **told, **fields})
+
+
+def surface(nodes: np.ndarray, faces: np.ndarray, count: int, rng: np.random.Generator) -> np.ndarray:
+    """[count, 3] random points of a mesh with 3 mm of noise."""
+    corners = nodes[faces]
+    areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    chosen = corners[rng.choice(len(faces), count, p=areas / areas.sum())]
+    return np.einsum("nij,ni->nj", chosen, rng.dirichlet(np.ones(3), count)) + rng.normal(0, 0.003, (count, 3))
+
+
+def recorded(truth: HangScenario, seed: int = 0, points: int = 500) -> Episode:
+    """Clouds of a moving cloth, and the track of its gripper 85 mm above the held part."""
+    scenario, rng = hang_scenario(truth), np.random.default_rng(seed)
+    system, _ = scenario.scene.build()
+    with torch.no_grad():
+        motion = rollout(system, scenario.steps)
+    times = np.arange(scenario.frames + 1) / truth.rate_hz
+    nodes = motion.at(torch.as_tensor(times))[0].numpy()
+    path = np.array(truth.path, dtype=float)
+    track = (
+        np.stack([np.interp(times, path[:, 0], path[:, axis]) for axis in (1, 2, 3)], axis=1) + truth.rim_m + [0, 0, 0.085]
+    )
+    clouds = [surface(one, system.mesh.faces, points, rng) for one in nodes]
+    return Episode.from_frames(clouds, times, gripper=track[:, None])
+
+
+def cloth_of(episode: Episode, size: tuple[float, float]) -> dict:
+    return {name: found.value for name, found in found_cloth([episode], size, 0.2).items()}
+
+
+class TestScenario:
+    def test_it_begins_at_rest(self):
+        for held in ("edge", "corners", "corner"):
+            scenario = hang_scenario(options(held=held, path=[(0, 0, 0, 0), (1, 0, 0, 0)], frames=10))
+            run_ = rollout(scenario.scene.build()[0], scenario.steps)
+            assert float((run_.positions[0, -1] - run_.positions[0, 0]).norm(dim=-1).max()) < 5e-4
+
+    def test_its_weight_stretches_it_as_a_rod(self):
+        """A strip of density ρ stretches by ρ g h² / (2 k) under its own weight, where Poisson's ratio is zero."""
+        material = {**MATERIAL, "stretching_n_m": 20.0, "poisson": 0.0}
+        scenario = hang_scenario(options(material=material, nodes=(9, 31)))
+        longer = np.ptp(scenario.scene.mesh.nodes[:, 2]) - 0.24
+        assert longer == pytest.approx(0.2 * 9.81 * 0.24**2 / (2 * 20.0), rel=0.05)
+
+    def test_a_held_edge_is_straight(self):
+        with pytest.raises(SceneError, match="a held edge is straight"):
+            hang_scenario(options(span=0.8))
+
+
+class TestLayout:
+    @pytest.mark.parametrize(
+        ("fields", "held"),
+        [
+            ({}, "edge"),
+            ({"side": "y"}, "edge"),
+            ({"held": "corners"}, "edge"),  # two corners without slack look like their side
+            ({"held": "corners", "span": 0.9}, "corners"),
+            ({"held": "corners", "span": 0.8, "yaw_deg": 200.0}, "corners"),
+            ({"held": "corner"}, "corner"),
+        ],
+    )
+    def test_the_start_is_found(self, fields, held):
+        truth = options(**fields)
+        episode, sentence = prepared(recorded(truth))
+        assert hangs(episode)
+        assert sentence == ""  # the stamps are right
+        layout = find_hanging(episode, cloth_of(episode, (0.30, 0.24)))
+        found = {name: one.value for name, one in layout.fields.items()}
+        assert found["held"] in (held, truth.held)
+        if held != "corner":
+            assert found["side"] == truth.side
+        assert np.linalg.norm(np.subtract(found["rim_m"], truth.rim_m)) < 0.012
+        assert "it follows the gripper without turning" in layout.warnings[0]
+
+    def test_the_size_is_seen(self):
+        assert hanging_size(recorded(options())) == pytest.approx((0.30, 0.25), abs=0.02)
+
+    def test_another_size_is_refused_with_all_distances(self):
+        episode, _ = prepared(recorded(options()))
+        with pytest.raises(
+            EpisodeError, match=r"hangs at rest. RMS distances: .*mm; .*at most 25 mm are allowed. Check --size"
+        ):
+            find_hanging(episode, cloth_of(episode, (0.6, 0.5)))
+
+    def test_a_gripper_elsewhere_is_refused(self):
+        episode = recorded(options())
+        episode, _ = prepared(replace(episode, gripper=episode.gripper + np.array([0.0, 0.6, 0.0])))
+        with pytest.raises(EpisodeError, match="from the gripper; at most"):
+            find_hanging(episode, cloth_of(episode, (0.30, 0.24)))
+
+    def test_a_flat_cloth_does_not_hang(self):
+        cloud = np.random.default_rng(0).uniform(-0.15, 0.15, (400, 3)) * [1, 1, 0.01]
+        flat = Episode.from_frames([cloud, cloud], np.array([0.0, 0.1]), gripper=np.full((2, 1, 3), 0.1))
+        assert not hangs(flat)
+        with pytest.raises(EpisodeError, match="In some recordings the cloth hangs"):
+            found_cloth([flat, recorded(options())])
+
+
+class TestStamps:
+    def test_late_clouds_get_their_times_back(self):
+        rng = np.random.default_rng(3)
+        episode = recorded(
+            options(frames=60, path=[*PATH[:-1], (3.0, 0, 0.2, 0), (3.6, 0, -0.2, 0), (4.2, 0, 0.2, 0), (6.0, 0, 0, 0)])
+        )
+        lags = 0.25 + rng.normal(0, 0.02, episode.frame_count)
+        stamps = np.maximum.accumulate(episode.times + lags)
+        track = np.stack([np.interp(stamps, episode.times, episode.gripper[:, 0, axis]) for axis in range(3)], axis=1)
+        late = replace(episode, times=stamps - stamps[0], gripper=track[:, None])
+        _, found = corrected_stamps(late)
+        assert found is not None
+        moving = slice(8, 42)
+        assert np.abs(found.seconds - lags)[moving].mean() < 0.05
+        assert np.median(found.seconds) == pytest.approx(0.25, abs=0.025)
+
+    def test_right_stamps_stay(self):
+        episode = recorded(options())
+        assert corrected_stamps(episode) == (episode, None)
+
+    def test_a_recording_is_prepared_once(self):
+        once, _ = prepared(recorded(options()))
+        assert prepared(once) == (once, "")
+        assert once.times[0] == 1.0
+
+
+@pytest.mark.slow
+def test_the_command_fits_a_folder_of_clouds_and_a_track_of_another_rate(tmp_path):
+    truth = options()
+    folder = tmp_path / "towel"
+    folder.mkdir()
+    episode = recorded(truth)
+    for frame, time in enumerate(episode.times):
+        cloud = episode.frame(frame).copy()
+        cloud[::50] = np.nan
+        np.save(folder / f"cloud_{100 + time:.4f}.npy", cloud)
+    times = np.arange(0, 3.5, 0.017)
+    path = np.array(truth.path, dtype=float)
+    moved = (
+        np.stack([np.interp(times, path[:, 0], path[:, axis]) for axis in (1, 2, 3)], axis=1) + truth.rim_m + [0, 0, 0.085]
+    )
+    rows = [f"{100 + t:.5f},{x:.6f},{y:.6f},{z:.6f}" for t, (x, y, z) in zip(times, moved, strict=True)]
+    (folder / "gripper.csv").write_text("\n".join(["t_s,x,y,z", *rows]) + "\n")
+    out = tmp_path / "fit"
+    invoke("fit", folder, "--size", "0.30x0.24", "--density", "0.2", "--out", out, "--budget", "none")
+    told = json.loads((out / "fit.json").read_text())
+    assert told["rms_mm"] < 6
+    intervals = json.loads((out / "intervals.json").read_text())
+    low, high = (intervals["parameters"]["stretching"][end] for end in ("low", "high"))
+    assert low < 80.0 < high
