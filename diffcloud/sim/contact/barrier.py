@@ -5,8 +5,7 @@ The potential of one contact at distance d below the thickness d̂ is
     φ(d) = -(K/6) (d - d̂)² ln(d / d̂),      K = k_c A.
 
 It is twice continuously differentiable at d̂ and infinite at d = 0 (Li et al. 2020, Incremental Potential Contact, IPC). It
-is weighted by the area A (Li et al. 2023, Convergent IPC), and scaled so that near d̂ it equals ARCSim's K (d̂ - d)³ / (6
-d̂).
+is weighted by the area A (Li et al. 2023, Convergent IPC). Near d̂ it equals ARCSim's potential K (d̂ - d)³ / (6 d̂).
 
 A point near a mesh is repelled by every face within d̂. Where faces meet, this sum would count a contact twice. So each
 shared edge is subtracted once, and each interior point is added back once (inclusion and exclusion, as in Convergent IPC).
