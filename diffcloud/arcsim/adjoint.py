@@ -160,10 +160,8 @@ def candidates(scene: Scene, motion: Motion):  # type: ignore[no-untyped-def]
 
 @kernel
 def stop_at_planes(scene: Scene, above, places: Floats, backwards: int) -> None:  # type: ignore[no-untyped-def]
-    """Project vectors of nodes onto the planes that stop them: remove the component along each plane's normal.
-
-    Each projection is its own transpose. The transpose of their product is the product in reverse order (`backwards`).
-    """
+    """Project vectors of nodes onto the planes that stop them: remove the component along each plane's normal. Each
+    projection is its own transpose. The transpose of their product is the product in reverse order (`backwards`)."""
     count = len(above)
     for q in range(count):
         p = count - 1 - q if backwards > 0 else q

@@ -70,10 +70,8 @@ def repelling(reach: float, pattern: Pattern, corners: Ints, constants: Floats):
 
 @kernel
 def pattern_with(base: Pattern, corners: Ints) -> tuple[Pattern, Ints]:
-    """Extend the pattern by the couplings of pairs [C, 5]. Return it with the new positions of the base's blocks.
-
-    The positions are empty if nothing changed.
-    """
+    """Extend the pattern by the couplings of pairs [C, 5]. Return it with the new positions of the base's blocks. The
+    positions are empty if nothing changed."""
     nodes = len(base.place)
     first, second = np.empty(6 * len(corners), np.int64), np.empty(6 * len(corners), np.int64)
     count = 0

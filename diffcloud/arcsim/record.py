@@ -19,10 +19,8 @@ class Kept(NamedTuple):
     solved: Floats
     """[S, V, 3] velocities after the linear system, before contact [m/s]."""
     begins: Ints
-    """[S + 1, 5] first row of each step in `corners`, `impacts.met`, `impacts.passes`, `impacts.forces` and `factors`.
-
-    A step without rows in `factors` has its factor recomputed.
-    """
+    """[S + 1, 5] first row of each step in `corners`, `impacts.met`, `impacts.passes`, `impacts.forces` and `factors`. A
+    step without rows in `factors` has its factor recomputed."""
     corners: Ints
     """[., 5] kind and points of the repelling pairs."""
     constants: Floats
@@ -34,7 +32,7 @@ class Kept(NamedTuple):
 
 @kernel
 def nothing_kept(steps: int, nodes: int) -> Kept:
-    """An empty record."""
+    """Create an empty record."""
     corners, constants, factors = np.empty((16, 5), np.int64), np.empty((16, 4)), np.empty((16, 9))
     begins = np.zeros((steps + 1, 5), np.int64)
     return Kept(np.empty((steps, nodes, 3)), begins, corners, constants, no_impacts(), factors)

@@ -24,7 +24,7 @@ class Scene(NamedTuple):
     """Elements of the force terms (`kernels.Terms`)."""
     pattern: Pattern
     time_step: float
-    """[s]"""
+    """Time step [s]."""
     obstacles: Floats
     """[O, 3] points of static obstacles [m]."""
     plane_normals: Floats

@@ -151,11 +151,7 @@ def displace(scene: Scene, parameters: Parameters, nodes: int, motion: Motion) -
 
 @kernel
 def project(scene: Scene, points: Floats, above) -> None:  # type: ignore[no-untyped-def]
-    """Move nodes that are behind a plane to the projection thickness above it.
-
-    Args:
-        above: bool [P, V] receives True for nodes that were not behind the plane.
-    """
+    """Move nodes behind a plane to the projection thickness above it. `above` [P, V] receives True for the other nodes."""
     for p in range(len(scene.plane_offsets)):
         normal = scene.plane_normals[p]
         for i in range(above.shape[1]):

@@ -13,4 +13,4 @@ CONTACTS: tuple[Term, ...] = (PROXIMITY_POINT_FACE, PROXIMITY_EDGE_EDGE)
 """Contact terms, whose point pairs each step detects."""
 
 kernels = integrator_kernels("arcsim", SHARED, (PLANES,), CONTACTS, (POINT_FACE_MEETING, EDGE_EDGE_MEETING))
-"""`kernels.assemble`, `kernels.Terms`, `kernels.bending_force`, ..."""
+"""Module of the generated kernels, such as `kernels.assemble`, `kernels.Terms` and `kernels.bending_force`."""

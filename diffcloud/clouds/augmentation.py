@@ -131,9 +131,7 @@ class CloudMaker:
 
     def seen(self, nodes: Tensor) -> Tensor | None:
         """Visibility of the cloth's faces from the augmentation's viewpoints, bool [B, T, F], for motions [B, T, V, 3].
-
-        None without viewpoints.
-        """
+        None without viewpoints."""
         if not self.augmentation.viewpoints:
             return None
         eyes = torch.tensor(self.augmentation.viewpoints, dtype=torch.float64)[None]
@@ -179,10 +177,8 @@ class CloudMaker:
         return found.view(batch, frames, self.points, 3)
 
     def _sampled_faces(self, fraction: Tensor, keys: Tensor, frames: int) -> Tensor:
-        """Weight of each face, float32 [B, T, F + O]: 1 if the face is sampled, else 0.
-
-        Each run orders its faces at random, and each frame uses the first ones. So hidden faces remain hidden.
-        """
+        """Weight of each face, float32 [B, T, F + O]: 1 if the face is sampled, else 0. Each run orders its faces at
+        random, and each frame uses the first ones. So hidden faces remain hidden."""
         low, high = self.augmentation.keep
         keep = low + (high - low) * fraction  # [B, 1]
         if self.augmentation.falling and frames > 1:

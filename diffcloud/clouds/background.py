@@ -41,10 +41,8 @@ class Background:
         return held.view(points.shape[:-1])
 
     def first_free(self, points: Tensor, count: int) -> Tensor:
-        """The first `count` points [..., count, 3] of [..., N, 3] that do not belong to the body.
-
-        If there are fewer, they are repeated. If there are none, points of the body are returned.
-        """
+        """The first `count` points [..., count, 3] of [..., N, 3] that do not belong to the body. If there are fewer, they
+        are repeated. If there are none, points of the body are returned."""
         held = self.holds(points)
         order = held.to(torch.uint8).argsort(dim=-1, stable=True)
         free = (~held).sum(-1, keepdim=True)

@@ -46,10 +46,7 @@ class NeighbourIndex:
     @cached_property
     def normals(self) -> Tensor:
         """Unit normals [P, 3] of the sampled surface, from the plane through each point's neighbours. Their signs are
-        arbitrary.
-
-        Zero if there are fewer than three points.
-        """
+        arbitrary. Zero if there are fewer than three points."""
         index = self._beside[1]
         if index.shape[1] < _FEWEST:
             return torch.zeros_like(self.points)
@@ -63,11 +60,9 @@ class NeighbourIndex:
 
     @property
     def from_surface(self) -> tuple[float, float]:
-        """Mean squared distances [m²] from the surface to the nearest point, and from a point to the surface.
-
-        Surface positions are points projected to the plane of their neighbours, and a point is not its own neighbour. Zero
-        if there are fewer than three points.
-        """
+        """Mean squared distances [m²] from the surface to the nearest point, and from a point to the surface. Surface
+        positions are points projected to the plane of their neighbours, and a point is not its own neighbour. Zero if there
+        are fewer than three points."""
         index = self._beside[1]
         if index.shape[1] < _FEWEST:
             return 0.0, 0.0
@@ -134,11 +129,9 @@ def _as_array(points: Tensor) -> Floats:
 
 
 def flattest_directions(points: Floats, groups: Ints) -> Floats:
-    """Unit directions [G, 3] of the smallest spread of groups [G, n] of points [P, 3].
-
-    Eigenvectors of 3 × 3 matrices in closed form (Smith 1961), five times as fast as a general solver. The solver is used
-    if two spreads are almost equal, for example for points on a line.
-    """
+    """Unit directions [G, 3] of the smallest spread of groups [G, n] of points [P, 3]. Eigenvectors of 3 × 3 matrices in
+    closed form (Smith 1961), five times as fast as a general solver. The solver is used if two spreads are almost equal,
+    for example for points on a line."""
     x, y, z = (np.ascontiguousarray(column)[groups] for column in points.T)
     for part in (x, y, z):
         part -= part.mean(axis=1, keepdims=True)

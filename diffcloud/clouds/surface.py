@@ -25,10 +25,8 @@ _EQUAL, _TOGETHER = 1e-9, 1e-24
 
 @kernel
 def nearest_on_triangle(x: float, y: float, z: float, nodes: Floats, i: int, j: int, k: int, place: Floats) -> float:
-    """Squared distance of a point from the triangle of nodes i, j, k [m²] (Ericson 2005, section 5.1.5).
-
-    `nodes` is [V, 3]. `place` [3] receives the barycentric coordinates of the nearest point.
-    """
+    """Squared distance of a point from the triangle of nodes i, j, k [m²] (Ericson 2005, section 5.1.5). `nodes` is [V, 3].
+    `place` [3] receives the barycentric coordinates of the nearest point."""
     a0, a1, a2 = nodes[i, 0], nodes[i, 1], nodes[i, 2]
     b0, b1, b2 = nodes[j, 0], nodes[j, 1], nodes[j, 2]
     c0, c1, c2 = nodes[k, 0], nodes[k, 1], nodes[k, 2]
@@ -98,9 +96,7 @@ def _spheres(nodes: Floats, faces: Ints, groups: Ints, spheres: Floats) -> None:
 @kernel
 def _sides(nodes: Floats, faces: Ints, groups: Ints, sides: Floats) -> None:
     """Compute four planes of each face into `sides` [G, 16, 8]: normal and offset of the face, then those of its edges.
-
-    Normals of edges are in the plane of the face and point outwards. All are zero for a face without area.
-    """
+    Normals of edges are in the plane of the face and point outwards. All are zero for a face without area."""
     sides[:] = 0.0
     for g in range(len(groups)):
         for lane in range(_GROUP):
@@ -200,10 +196,7 @@ def find_on_surface(queries: Floats, guesses: Ints, nodes: Floats, faces: Ints) 
 @kernel
 def meets_triangle(start: Floats, way: Floats, nodes: Floats, i: int, j: int, k: int) -> float:
     """Distance along a unit direction `way` [3] at which a ray meets the triangle of nodes i, j, k [m]; negative if it does
-    not.
-
-    `nodes` is [V, 3] (Möller and Trumbore 1997).
-    """
+    not. `nodes` is [V, 3] (Möller and Trumbore 1997)."""
     a0, a1, a2 = nodes[i, 0], nodes[i, 1], nodes[i, 2]
     e1x, e1y, e1z = nodes[j, 0] - a0, nodes[j, 1] - a1, nodes[j, 2] - a2
     e2x, e2y, e2z = nodes[k, 0] - a0, nodes[k, 1] - a1, nodes[k, 2] - a2

@@ -31,7 +31,7 @@ class Tree(NamedTuple):
     """Search tree of a cloud of P points."""
 
     points: Floats
-    """[P, 3] [m]"""
+    """[P, 3] points [m]."""
     order: Ints
     """[P] indices of the points along the curve."""
     leaves: Floats

@@ -178,11 +178,7 @@ def vest_cloth(width: float, height: float, depth: float) -> ClothMesh:
 
 
 def vest_shoulder(side: int) -> list[int]:
-    """Nodes of `vest_cloth` on one shoulder seam, from the neck to the arm.
-
-    Args:
-        side: 1 for the shoulder at +x, -1 for the shoulder at -x.
-    """
+    """Nodes of `vest_cloth` on one shoulder seam, from the neck to the arm: at +x for `side` 1, at -x for -1."""
     index = np.cumsum(_vest_present()).reshape(_VEST_ACROSS.shape) - 1
     columns = [4, 5, 6] if side > 0 else [2, 1, 0]
     return [int(node) for node in index[_SHOULDER_ROW, columns]]
@@ -281,10 +277,8 @@ def sphere_surface(center: Sequence[float], radius: float, subdivisions: int = 2
 
 
 def _grid_faces(rows: int, columns: int, through: int) -> IntArray:
-    """Faces [2 (rows - 1)(columns - 1), 3] of a grid whose point (i, j) has index i·columns + j.
-
-    Diagonals meet at the point `through`, and at all points an even number of cells away.
-    """
+    """Faces [2 (rows - 1)(columns - 1), 3] of a grid whose point (i, j) has index i·columns + j. Diagonals meet at the
+    point `through`, and at all points an even number of cells away."""
     i, j = (index.ravel() for index in np.meshgrid(np.arange(rows - 1), np.arange(columns - 1), indexing="ij"))
     a = i * columns + j
     turned = (i + j) % 2 == sum(divmod(through, columns)) % 2
@@ -292,10 +286,8 @@ def _grid_faces(rows: int, columns: int, through: int) -> IntArray:
 
 
 def _quad_faces(corners: IntArray, turned: NDArray[np.bool_]) -> IntArray:
-    """Triangles [2 Q, 3] of quads [Q, 4], given as (left bottom, right bottom, left top, right top).
-
-    The diagonal starts at the right bottom, or if `turned` at the left bottom.
-    """
+    """Triangles [2 Q, 3] of quads [Q, 4], given as (left bottom, right bottom, left top, right top). The diagonal starts at
+    the right bottom, or if `turned` at the left bottom."""
     a, b, c, d = corners.T
     first = np.where(turned[:, None], np.stack([a, b, d], axis=1), np.stack([a, b, c], axis=1))
     second = np.where(turned[:, None], np.stack([a, d, c], axis=1), np.stack([b, d, c], axis=1))
@@ -328,11 +320,8 @@ def _vest_faces() -> IntArray:
 
 
 def _on_half_ellipse(arc: FloatArray, depth: float, length: float) -> tuple[FloatArray, FloatArray]:
-    """Points (x, y >= 0) on a half ellipse with semi-axis `depth` along y and arc length `length`.
-
-    Args:
-        arc: signed arc length from the top of the ellipse, in ±length/2 [m].
-    """
+    """Points (x, y >= 0) on a half ellipse with semi-axis `depth` along y and arc length `length`. `arc` is the signed arc
+    length from the top of the ellipse, in ±length/2 [m]."""
     angle = np.linspace(0, np.pi / 2, _ARC_SAMPLES)
 
     def quarter(semi_axis: float) -> FloatArray:

@@ -158,11 +158,8 @@ class ClothMesh:
 
     @cached_property
     def size(self) -> float:
-        """Largest distance between two nodes along edges, in material space [m].
-
-        Computed from the farthest node of node 0, and the farthest node of that one. This is exact for cloths without long
-        arms.
-        """
+        """Largest distance between two nodes along edges, in material space [m]. Computed from the farthest node of node 0,
+        and the farthest node of that one. This is exact for cloths without long arms."""
         from scipy.sparse import coo_array
         from scipy.sparse.csgraph import dijkstra  # slow to import
 

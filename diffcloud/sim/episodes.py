@@ -33,11 +33,8 @@ _PROPERTIES = tuple(field.name for field in fields(Properties))
 
 
 class Batch:
-    """A batch of B episodes of one system over S steps.
-
-    Inputs have a leading batch axis: positions and velocities [B, V, 3], poses of the N bodies [B, N, 18], tracks of the G
-    grippers [B, S, G, 3], and the fields of `Properties`.
-    """
+    """A batch of B episodes of one system over S steps. Inputs have a leading batch axis: positions and velocities
+    [B, V, 3], poses of the N bodies [B, N, 18], tracks of the G grippers [B, S, G, 3], and the fields of `Properties`."""
 
     def __init__(self, system: System, steps: int, *, tracked: bool, progress: Callable[[int], None] | None = None) -> None:
         self.system, self.steps = system, steps

@@ -54,11 +54,7 @@ class Grasp:
     """Side of the square [m]."""
 
     def described(self, nodes: int) -> str:
-        """Text that describes the grasp.
-
-        Args:
-            nodes: number of nodes that are held.
-        """
+        """Text that describes the grasp, for `nodes` held nodes."""
         size = f"{1e3 * self.size:.3g} mm"
         if self.kind == "pivot":
             return f"pivot of {size}"

@@ -29,9 +29,9 @@ class Held(NamedTuple):
     strength: Floats
     """[S, H] relative stiffness in [0, 1]."""
     linear: Floats
-    """[S, H, 3, 3]"""
+    """[S, H, 3, 3] scale times rotation."""
     translation: Floats
-    """[S, H, 3] [m]"""
+    """[S, H, 3] translation [m]."""
     first_step: Ints
     """[H] index of the step that sets the anchor; S if no step does."""
     inverse: Floats

@@ -37,9 +37,9 @@ class Episode(NamedTuple):
     anchors: Floats
     """[H, 3] anchors of the handles [m]; `simulate` fills them."""
     positions: Floats
-    """[S + 1, V, 3] [m]"""
+    """[S + 1, V, 3] node positions [m]."""
     velocities: Floats
-    """[S + 1, V, 3] [m/s]"""
+    """[S + 1, V, 3] node velocities [m/s]."""
     bodies: Floats
     """[S + 1, B, 18] centre [m], rotation matrix in row-major order, velocity [m/s], angular velocity [rad/s]."""
 
@@ -74,11 +74,8 @@ class Derivatives(NamedTuple):
 
 @runtime_checkable
 class Integrator(Protocol):
-    """A time stepping scheme with its contact model and its derivatives.
-
-    `simulate`, `reverse` and `tangents` process one cloth. Several threads call them at once, so they must release Python's
-    global interpreter lock, as kernels do.
-    """
+    """A time stepping scheme with its contact model and its derivatives. `simulate`, `reverse` and `tangents` process one
+    cloth. Several threads call them at once, so they must release Python's global interpreter lock, as kernels do."""
 
     name: str
     """Its key in `INTEGRATORS`."""
@@ -103,11 +100,8 @@ class Integrator(Protocol):
         """Return the surroundings with the default contact model of this integrator."""
 
     def resting_height(self, contact: ContactSettings, weight: float) -> float:
-        """Height above a level obstacle at which contact supports a cloth [m].
-
-        Args:
-            weight: of the cloth per area [N/m²], above 0.
-        """
+        """Height above a level obstacle at which contact supports a cloth of weight `weight` per area [N/m²], above 0
+        [m]."""
 
     def build(self, setup: Setup, time_step: float) -> Any:
         """Build the constant data for the kernels, for steps of `time_step` [s]."""
@@ -147,11 +141,7 @@ class Integrator(Protocol):
         """Elastic energy of a cloth at node positions [V, 3] [J]."""
 
     def fault(self, entry: int, episode: Episode, outcome: Outcome) -> DivergedError:
-        """The error for an episode that ended with one of the integrator's own status numbers.
-
-        Args:
-            entry: index in the batch, for the message.
-        """
+        """Error for batch entry `entry`, whose episode ended with one of the integrator's own status numbers."""
 
 
 @cache

@@ -42,7 +42,7 @@ class Material:
 
     name: str
     density: float
-    """[kg/m²]"""
+    """Mass per area [kg/m²]."""
     stretching: NDArray[np.float64]
     """[6, 4] table [N/m]; entries are half of the stiffness."""
     bending: NDArray[np.float64]
@@ -94,10 +94,8 @@ class Material:
 
     @property
     def resting_stretching_stiffness(self) -> float:
-        """Force per width per strain [N/m] of a strip with free sides at zero strain, mean of both directions.
-
-        This is the SI value of a multiplier of 1.
-        """
+        """Force per width per strain [N/m] of a strip with free sides at zero strain, mean of both directions. This is the
+        SI value of a multiplier of 1."""
         k0, k1, k2 = (float(entry) for entry in self.stretching[0, :3])
         coupled = k1**2 / max(k0, _LEAST) + k1**2 / max(k2, _LEAST)
         return TABLE_ENTRY_TO_STRETCHING * 0.5 * (k0 + k2 - coupled)

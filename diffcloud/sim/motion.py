@@ -18,12 +18,12 @@ class Keyframe:
     """A transform x -> translation + scale · R x at a time, with an optional time derivative."""
 
     time: float
-    """[s]"""
+    """Time of the keyframe [s]."""
     translation: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """[m]"""
+    """Translation [m]."""
     scale: float = 1.0
     quaternion: tuple[float, float, float, float] = _IDENTITY_QUATERNION
-    """(w, x, y, z)"""
+    """Rotation as a quaternion (w, x, y, z)."""
     velocity: tuple[float, ...] | None = None
     """[8] time derivative of (translation, scale, quaternion). None: central difference, zero at the first and last
     keyframe."""
@@ -45,7 +45,7 @@ class Motion:
             raise SceneError(f"A motion needs keyframes at increasing times, got times {times}.")
 
     def at(self, times: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Transforms at times [S]: linear part scale · R [S, 3, 3] and translation [S, 3] [m]."""
+        """Transforms at times [S] [s]: linear part scale · R [S, 3, 3] and translation [S, 3] [m]."""
         key_times = np.array([key.time for key in self.keyframes])
         values = np.array([[*key.translation, key.scale, *key.quaternion] for key in self.keyframes])
         if len(values) == 1:

@@ -42,10 +42,10 @@ class Motion:
     """One cloth over S steps, and what moves it. Values are in the scene's units."""
 
     positions: Floats
-    """[S + 1, V, 3]"""
+    """[S + 1, V, 3] node positions."""
     time_step: float
     mass: Floats
-    """[V]"""
+    """[V] node masses."""
     size: float
     """Size of the cloth (`ClothMesh.size`)."""
     places: Floats
@@ -53,7 +53,7 @@ class Motion:
     held: NDArray[np.bool_]
     """[S, H] True if a handle holds its node in a step."""
     gravity: Floats
-    """[3]"""
+    """[3] gravitational acceleration."""
     wind: float
     """Wind speed."""
     velocities: Floats
@@ -83,11 +83,7 @@ def implausible(motion: Motion, stored: Callable[[int], float]) -> tuple[int, st
 
 
 def _energies(motion: Motion, fallen: Floats) -> tuple[Floats, Floats, Floats]:
-    """K, P and E of the module's docstring after every step, each [S].
-
-    Args:
-        fallen: [S] from `_fallen`.
-    """
+    """K, P and E of the module's docstring after every step, each [S]; `fallen` [S] is the result of `_fallen`."""
     step, mass = motion.time_step, float(motion.mass.sum())
     velocities = np.diff(motion.positions, axis=0) / step
     kinetic = 0.5 * np.einsum("svi,svi,v->s", velocities, velocities, motion.mass)
@@ -105,12 +101,8 @@ def _energies(motion: Motion, fallen: Floats) -> tuple[Floats, Floats, Floats]:
 def _too_far(
     motion: Motion, fallen: Floats, given: Floats, spent: Floats, stored: Callable[[int], float]
 ) -> tuple[int, str] | None:
-    """Step and reason of the first node that is too far from all handles, or None.
-
-    Args:
-        fallen: [S] from `_fallen`.
-        given, spent: [S] K and P - E of the module's docstring.
-    """
+    """Step and reason of the first node that is too far from all handles, or None. `fallen` [S] is the result of `_fallen`,
+    `given` and `spent` [S] are K and P - E of the module's docstring."""
     places = np.concatenate([motion.places[1:][motion.held], motion.others.reshape(-1, 3)])
     if not len(places):
         places = motion.positions[0]

@@ -53,7 +53,7 @@ class Properties:
         return len(self.damping)
 
     def tensors(self) -> tuple[Tensor, ...]:
-        """The fields in order."""
+        """Return all fields in the order of their definition."""
         return tuple(getattr(self, field.name) for field in fields(self))
 
     def repeated(self, count: int) -> Properties:

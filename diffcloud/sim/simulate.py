@@ -22,14 +22,14 @@ from diffcloud.sim.system import State, System
 
 @dataclass(frozen=True)
 class Rollout:
-    """A batch of trajectories."""
+    """Simulated trajectories of a batch of cloths."""
 
     positions: Tensor
-    """[B, S + 1, V, 3] at the start and after each of S steps [m]."""
+    """[B, S + 1, V, 3] node positions at the start and after each of S steps [m]."""
     times: Tensor
-    """[S + 1] [s]"""
+    """[S + 1] times of these states [s]."""
     velocities: Tensor
-    """[B, S + 1, V, 3] [m/s]"""
+    """[B, S + 1, V, 3] node velocities [m/s]."""
     bodies: BodyState | None = None
     """Rigid bodies, with fields stacked as [B, S + 1, N, ...]; None without bodies."""
     diverged: Mapping[int, DivergedError] = field(default_factory=dict)

@@ -27,7 +27,7 @@ AIR_DENSITY = 1.2
 _VISCOSITY = 1.5e-5
 """Kinematic viscosity of air [m²/s]."""
 _GRAVITY = 9.81
-"""[m/s²]"""
+"""Gravitational acceleration [m/s²]."""
 _RATIOS = (1.0, 1.25, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.25, 8.0, 10.0)
 _ADDED = (0.579, 0.642, 0.690, 0.757, 0.801, 0.830, 0.872, 0.897, 0.917, 0.934, 0.947)
 """C_A at the aspect ratios `_RATIOS`."""
@@ -38,17 +38,13 @@ class StillAir:
     """Effect of still air on a cloth."""
 
     added_mass: float
-    """[kg/m²]"""
+    """Mass per area of the air that moves with the cloth [kg/m²]."""
     linear_drag: float
-    """[kg/(m²·s)]"""
+    """Coefficient of the linear drag [kg/(m²·s)]."""
 
 
 def still_air(mesh: ClothMesh, density: float = AIR_DENSITY) -> StillAir:
-    """Added mass and drag for the bounding rectangle of a cloth in material space.
-
-    Args:
-        density: of the air [kg/m³].
-    """
+    """Added mass and drag for the bounding rectangle of a cloth in material space, in air of a density [kg/m³]."""
     short, long = sorted(np.ptp(mesh.verts, axis=0).tolist())
     added = math.pi / 4 * float(np.interp(long / short, _RATIOS, _ADDED)) * density * short
     frequency = math.sqrt(1.5 * _GRAVITY / long)

@@ -31,10 +31,8 @@ class ContactSettings:
 
 @dataclass(frozen=True)
 class ReferenceContact:
-    """Options in which ARCSim differs from a correct implementation.
-
-    The defaults are the correct variant. `as_published` reproduces ARCSim.
-    """
+    """Options in which ARCSim differs from a correct implementation. The defaults are the correct variant. `as_published`
+    reproduces ARCSim."""
 
     smallest: float = 0.0
     """Pairs of edges with |a × b|² below this never touch [m⁴]."""
@@ -54,11 +52,11 @@ class Surrounding:
     """Gravity, air, obstacles and contact around the cloth."""
 
     gravity: tuple[float, float, float] = (0.0, 0.0, -9.81)
-    """[m/s²]"""
+    """Gravitational acceleration [m/s²]."""
     wind: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Air velocity [m/s]."""
     air_density: float = 1.0
-    """[kg/m³]. The default is ARCSim's; real air has 1.2."""
+    """Density of the air [kg/m³]. The default is ARCSim's; real air has 1.2."""
     air_drag: float = 0.0
     """Coefficient of the linear tangential drag [kg/(m²·s)]."""
     added_mass: float = 0.0

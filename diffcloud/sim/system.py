@@ -22,7 +22,7 @@ class System:
 
     setup: Setup
     time_step: float
-    """[s]"""
+    """Length of a step [s]."""
     properties: Properties
     """Properties of the nominal material, batch 1."""
 
@@ -61,11 +61,11 @@ class System:
 
 @dataclass(frozen=True)
 class State:
-    """A batch of cloths at one time."""
+    """State of a batch of cloths at one time."""
 
     positions: Tensor
-    """[B, V, 3] [m]"""
+    """[B, V, 3] node positions [m]."""
     velocities: Tensor
-    """[B, V, 3] [m/s]"""
+    """[B, V, 3] node velocities [m/s]."""
     bodies: BodyState | None = None
     """States of the rigid bodies; None: their initial states."""

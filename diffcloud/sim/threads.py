@@ -69,11 +69,8 @@ Found = TypeVar("Found")
 
 
 def map_threads(function: Callable[[Given], Found], given: Iterable[Given]) -> list[Found]:
-    """Apply a function to each item in threads, and return the results in order.
-
-    The calling thread's setting for recording torch gradients applies. Simulations inside the function end soon after
-    Ctrl-C.
-    """
+    """Apply a function to each item in threads, and return the results in order. The calling thread's setting for recording
+    torch gradients applies. Simulations inside the function end soon after Ctrl-C."""
     import torch  # imported here, because commands that only set the number of threads do not need it
 
     items, recording = list(given), torch.is_grad_enabled()
@@ -99,10 +96,8 @@ def _pool() -> ThreadPoolExecutor:
 
 
 def _finish(futures: Sequence[Future[Found]], look: Callable[[], None], stop: Callable[[], None]) -> list[Found]:
-    """Wait for all futures and return their results, or raise the first error in order.
-
-    On Ctrl-C or an error of `look`, stop the jobs, wait for them, and raise it again.
-    """
+    """Wait for all futures and return their results, or raise the first error in order. On Ctrl-C or an error of `look`,
+    stop the jobs, wait for them, and raise it again."""
     open_jobs = set(futures)
     try:
         while open_jobs:

@@ -48,9 +48,7 @@ def frame(kind: Kind, corners: Sequence[Vector]) -> tuple[list[Scalar], Vector]:
 
 def _meeting(kind: Kind, inputs: Sequence[Scalar], constants: Sequence[Scalar]) -> list[Scalar]:
     """Weights [4] and normal [3] at the time when four points moving straight from start to end, both [4, 3], are coplanar.
-
-    The time is differentiated by the implicit function theorem.
-    """
+    The time is differentiated by the implicit function theorem."""
     points = [Vector(*inputs[3 * k : 3 * k + 3]) for k in range(8)]
     start, end = points[:4], points[4:]
     time = constants[0]

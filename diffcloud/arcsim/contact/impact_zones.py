@@ -38,11 +38,8 @@ class Projection(NamedTuple):
     smallest: float
     """Pairs with |a × b|² below this never meet [m⁴] (ARCSim: 1e-6)."""
     residue: float
-    """Fraction of each correction that is omitted.
-
-    ARCSim's iterative solver leaves a larger gap for a smaller correction, which decides ties in the next step. 1e-9
-    reproduces this.
-    """
+    """Fraction of each correction that is omitted. ARCSim's iterative solver leaves a larger gap for a smaller correction,
+    which decides ties in the next step. 1e-9 reproduces this."""
 
 
 class Impacts(NamedTuple):
@@ -62,7 +59,7 @@ class Impacts(NamedTuple):
 
 @kernel
 def no_impacts() -> Impacts:
-    """An empty record."""
+    """Create an empty record."""
     ints, floats = np.empty((16, 5), np.int64), np.empty((16, 9))
     return Impacts(ints, floats, np.empty((16, 2), np.int64), np.empty((16, 2)), np.zeros(3, np.int64))
 

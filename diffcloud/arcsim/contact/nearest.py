@@ -18,10 +18,8 @@ from diffcloud.sim.contact.surface import Surface, SurfaceBox, boxed
 
 _OUTSIDE = 1e-6
 _PARALLEL = 1e-12
-"""Squared sine of the angle between two edges below which they never repel.
-
-Such edges have no common normal, and unbounded derivatives. Points and faces keep them apart.
-"""
+"""Squared sine of the angle between two edges below which they never repel. Such edges have no common normal, and unbounded
+derivatives. Points and faces keep them apart."""
 _TINY = 1e-30
 _TINIEST = 1e-300
 
@@ -38,10 +36,8 @@ class Repulsion(NamedTuple):
     count_once: bool
     """Whether a pair that has the slots of both its primitives counts once (ARCSim: twice)."""
     held: Floats
-    """[2 (P + F + E)] for each slot, the distance of the nearest pair of two obstacles, infinite if there is none [m].
-
-    More distant pairs with the cloth do not get the slot.
-    """
+    """[2 (P + F + E)] for each slot, the distance of the nearest pair of two obstacles, infinite if there is none [m]. More
+    distant pairs with the cloth do not get the slot."""
 
 
 @kernel
@@ -195,11 +191,8 @@ def _set_slots(surface: SurfaceBox, pairs: Ints, c: int, place: Floats, around: 
 
 @kernel
 def _on_outer_side(surface: SurfaceBox, edge: int, x: Floats, ends: int, others: int, place: Floats, faces: Floats) -> bool:
-    """Whether the contact point on the other edge is beyond this edge, as seen from each of its faces.
-
-    Args:
-        ends, others: first rows of this edge and of the other edge in x [4, 3].
-    """
+    """Whether the contact point on the other edge is beyond this edge, as seen from each of its faces. `ends` and `others`
+    are the first rows of this edge and of the other edge in x [4, 3]."""
     s, t = abs(place[others]), abs(place[others + 1])
     for side in range(2):
         face = surface.edge_faces[edge, side]
@@ -218,10 +211,8 @@ def _on_outer_side(surface: SurfaceBox, edge: int, x: Floats, ends: int, others:
 
 @kernel
 def _normals(surface: SurfaceBox, points: Floats) -> tuple[Floats, Floats]:
-    """Unit normals of faces [F, 3] and points [N, 3].
-
-    Normals of points follow Max 1999: the direction of the sum over corners of (e1 × e2)/(|e1|² |e2|²).
-    """
+    """Unit normals of faces [F, 3] and points [N, 3]. Normals of points follow Max 1999: the direction of the sum over
+    corners of (e1 × e2)/(|e1|² |e2|²)."""
     faces, around = np.empty((len(surface.faces), 3)), np.zeros((len(points), 3))
     for f in range(len(surface.faces)):
         for corner in range(3):

@@ -67,6 +67,6 @@ class Timing(NamedTuple):
     """Step length and time of the force evaluation."""
 
     time_step: float
-    """[s]"""
+    """Time step [s]."""
     ahead: float
     """Time from `positions` to the end of the step [s]: the time step, or zero if they are those of its end."""

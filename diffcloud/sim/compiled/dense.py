@@ -8,11 +8,8 @@ from diffcloud.sim.compiled.data import Floats, Ints
 
 @kernel
 def lu(matrix: Floats, pivots: Ints) -> bool:
-    """Factorise a matrix [n, n] in place. Return False if it is singular.
-
-    Args:
-        pivots: [n] receives the row with which each row was swapped.
-    """
+    """Factorise a matrix [n, n] in place; `pivots` [n] receives the row with which each row was swapped. Return False if
+    the matrix is singular."""
     count = len(matrix)
     for k in range(count):
         best = k

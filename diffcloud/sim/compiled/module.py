@@ -185,10 +185,8 @@ def _assemble(term: Term) -> str:
 
 
 def _jacobian(term: Term) -> str:
-    """Code for the blocks [a, b] of displaced (-∂f/∂d) + moved (-∂f/∂before - ∂f/∂after) + moved · time_step (-∂f/∂x).
-
-    The code loops over columns: unrolled code would take seconds to compile.
-    """
+    """Code for the blocks [a, b] of displaced (-∂f/∂d) + moved (-∂f/∂before - ∂f/∂after) + moved · time_step (-∂f/∂x). The
+    code loops over columns: unrolled code would take seconds to compile."""
     formula = _Formula(term)
     groups = (formula.positions, formula.displacement, formula.before, formula.after)
     names = ("-moved * timing.time_step", "-displaced", "-moved", "-moved")
@@ -284,7 +282,7 @@ def _numbers(vectors: Iterable[Vector]) -> list[Scalar]:
 
 
 def _rate_source(source: str) -> str:
-    """parameters.x[e] -> parameter_rates.x[k, e]"""
+    """Rename an input to its derivative along direction k: parameters.x[e] -> parameter_rates.x[k, e]."""
     name, index = _renamed(source, "rates").split("[", 1)
     return f"{name}[k, {index}"
 

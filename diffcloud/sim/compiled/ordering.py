@@ -16,11 +16,11 @@ from diffcloud.sim.compiled.pool import with_room
 
 @kernel
 def minimum_degree(starts: Ints, neighbours: Ints) -> Ints:
-    """Return the place [V] of each node in the order of elimination.
+    """Return the position [V] of each node in the elimination order.
 
     Args:
-        starts: [V + 1] of each node's list in `neighbours`, which is overwritten.
-        neighbours: other nodes that each node shares a block with, each pair in both lists.
+        starts: [V + 1] start of each node's list in `neighbours`, which is overwritten.
+        neighbours: the nodes with which each node shares a block. Each pair is in both lists.
     """
     count = len(starts) - 1
     place, degree = np.full(count, -1, np.int64), np.empty(count, np.int64)

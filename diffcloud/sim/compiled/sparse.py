@@ -281,9 +281,7 @@ def reordered(of: Pattern) -> Ints:
 @kernel
 def cholesky(of: Pattern, matrix: Floats, factor: Floats) -> bool:
     """Cholesky factor [L, 9] of a matrix [A, 9] (left-looking). Return False if the matrix is not positive definite.
-
-    Diagonal blocks of the factor store the inverses of their own diagonals.
-    """
+    Diagonal blocks of the factor store the inverses of their own diagonals."""
     count = len(of.place)
     starts, rows = of.factor_starts, of.factor_rows
     work = np.zeros((count, 9))

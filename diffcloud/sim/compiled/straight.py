@@ -41,10 +41,7 @@ _INTEGER, _DOUBLE = ir.IntType(64), ir.DoubleType()
 
 def straight(function: F) -> F:
     """Compile a function of arrays, numbers and named tuples for use in kernels. Its code must have only the forms named
-    above.
-
-    Indices must not be negative; they do not count from the end.
-    """
+    above. Indices must not be negative; they do not count from the end."""
     if UNCOMPILED:
         return function
     names = list(inspect.signature(function).parameters)
@@ -76,10 +73,8 @@ class _Array(NamedTuple):
 
 
 class _Emitter:
-    """Emits LLVM code for statements.
-
-    A value is a pair of its numba type and its LLVM value, which is a number or a vector with one number per lane.
-    """
+    """Emits LLVM code for statements. A value is a pair of its numba type and its LLVM value, which is a number or a vector
+    with one number per lane."""
 
     def __init__(self, context: Any, builder: Any, scope: dict[str, tuple[Any, Any]]) -> None:
         self.context, self.builder, self.scope = context, builder, scope

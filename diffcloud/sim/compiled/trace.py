@@ -159,12 +159,12 @@ class Vector:
 
 
 def dot(a: Vector, b: Vector) -> Scalar:
-    """a · b"""
+    """Dot product a · b."""
     return a.x * b.x + a.y * b.y + a.z * b.z
 
 
 def cross(a: Vector, b: Vector) -> Vector:
-    """a × b"""
+    """Cross product a × b."""
     return Vector(a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x)
 
 

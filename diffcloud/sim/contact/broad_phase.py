@@ -91,9 +91,7 @@ def _pool(surface: SurfaceBox, first: Ints, second: Ints, rest_starts: Ints, res
 @kernel
 def boxes_of(surface: SurfaceBox, places: Floats, others: Floats, margin: float) -> tuple[Floats, Floats, Floats]:
     """Boxes of points [P, 6], faces [F, 6] and edges [E, 6] at both positions [N, 3]: lowest, then highest coordinates.
-
-    Boxes overlap if the boxes of the primitives come within `margin` of each other [m].
-    """
+    Boxes overlap if the boxes of the primitives come within `margin` of each other [m]."""
     return (
         _boxes(places, others, surface.points.reshape(-1, 1), 0.5 * margin),
         _boxes(places, others, surface.faces, 0.5 * margin),
@@ -177,10 +175,8 @@ def _widest(boxes: Floats) -> int:
 
 @kernel
 def _in_cells(pool: _Pool, first: Floats, second: Floats) -> Ints:
-    """Pairs [C, 3] by grids: one for all second boxes up to the typical size, and one for each doubling of it.
-
-    A box belongs to the cell of its low corner. Each first box is compared with the cells whose boxes can reach it.
-    """
+    """Pairs [C, 3] by grids: one for all second boxes up to the typical size, and one for each doubling of it. A box
+    belongs to the cell of its low corner. Each first box is compared with the cells whose boxes can reach it."""
     same = pool.first.shape[1] == pool.second.shape[1]  # both lists are edges: report each pair once
     level, levels = np.full(len(second), -1, np.int64), 1  # boxes that are not finite overlap with nothing
     total, finite = 0.0, 0
@@ -236,10 +232,8 @@ class Cells(NamedTuple):
 
 @kernel
 def _cells(boxes: Floats, level: Ints, grid: int, reach: float) -> Cells:
-    """Build the grid of the boxes [M, 6] of one level, none larger than `reach` [m].
-
-    Cells have half this size, or more if there would be too many.
-    """
+    """Build the grid of the boxes [M, 6] of one level, none larger than `reach` [m]. Cells have half this size, or more if
+    there would be too many."""
     taken = 0
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
     for m in range(len(boxes)):
@@ -319,7 +313,7 @@ def _note(pool: _Pool, found: Ints, count: int, a: int, b: int) -> int:
 
 @kernel
 def corners_of(surface: SurfaceBox, edges: int, a: int, b: int) -> tuple[int, int, int, int]:
-    """The four points of a pair."""
+    """Indices of the four points of a pair."""
     if edges:
         return surface.edges[a, 0], surface.edges[a, 1], surface.edges[b, 0], surface.edges[b, 1]
     return surface.points[a], surface.faces[b, 0], surface.faces[b, 1], surface.faces[b, 2]

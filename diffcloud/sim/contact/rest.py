@@ -137,7 +137,7 @@ def _reached(
 
 @kernel
 def listed_in(starts: Ints, members: Ints, n: int, one: int) -> bool:
-    """Whether a primitive is in list n of `Lists`."""
+    """Whether primitive `one` is in list n of `Lists`."""
     low, high = starts[n], starts[n + 1]
     while low < high:
         middle = (low + high) // 2

@@ -187,10 +187,8 @@ def _spread(edge_faces: NDArray[np.int64], face_area: NDArray[np.float64]) -> ND
 
 
 def _shares(faces: NDArray[np.int64], point_count: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return (`Surface.edge_share` [F, 3], `Surface.corner_share` [F, 3]) of a mesh.
-
-    The share is 1/2 at an inner edge, 1 / (number of faces around the point) at an inner point, and zero at the boundary.
-    """
+    """Return (`Surface.edge_share` [F, 3], `Surface.corner_share` [F, 3]) of a mesh. The share is 1/2 at an inner edge,
+    1 / (number of faces around the point) at an inner point, and zero at the boundary."""
     half = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]], axis=2).reshape(-1, 2)
     edges, inverse, count = np.unique(half, axis=0, return_inverse=True, return_counts=True)
     inner_edge = (count == 2)[inverse.ravel()].reshape(-1, 3)

@@ -62,11 +62,8 @@ def widen(work: Work, listed: Ints) -> None:
 def newton_matrix(
     work: Work, velocity: Floats, turned: Floats, listed: Ints, numbers: Floats, touching: Touching, caution: float
 ) -> General:
-    """Assemble and factorise Newton's matrix at the current motion.
-
-    Args:
-        caution: in [0, 1], weight of the positive semidefinite approximation; 0 gives the exact matrix.
-    """
+    """Assemble and factorise Newton's matrix at the current motion. `caution` in [0, 1] is the weight of the positive
+    semidefinite approximation; 0 gives the exact matrix."""
     widen(work, listed)
     time_step, start_positions, wide, terms = work.time_step, work.start_positions, work.wide, work.terms
     parameters, motion, start_bodies, pattern = work.parameters, work.motion, work.start_bodies, work.pattern
@@ -158,11 +155,7 @@ def _let_go(work: Work, lower: Floats, upper: Floats) -> None:
 
 @kernel
 def _add_inertia(work: Work, velocity: Floats, swing: Floats, lower: Floats) -> None:
-    """Add mass and rotational inertia of bodies.
-
-    Args:
-        swing: [P, 9] receives d point / d angular velocity over Δt.
-    """
+    """Add mass and rotational inertia of bodies. `swing` [P, 9] receives d point / d angular velocity over Δt."""
     start_positions, start_bodies, parameters, wide = work.start_positions, work.start_bodies, work.parameters, work.wide
     rigid, time_step = work.rigid, work.time_step
     nodes = len(start_positions)
@@ -329,7 +322,7 @@ def _couple(
 
 @kernel
 def _turn_columns(swing: Floats, p: int, block: Floats) -> None:
-    """block = block swing[p]."""
+    """In-place product block = block · swing[p]."""
     for r in range(0, 9, 3):
         x, y, z = block[r], block[r + 1], block[r + 2]
         for c in range(3):
@@ -338,7 +331,7 @@ def _turn_columns(swing: Floats, p: int, block: Floats) -> None:
 
 @kernel
 def _turn_rows(x: float, y: float, z: float, block: Floats) -> None:
-    """block = [x, y, z]× block."""
+    """In-place product of the cross-product matrix of (x, y, z) and a block."""
     for c in range(3):
         a, b, d = block[c], block[3 + c], block[6 + c]
         block[c], block[3 + c], block[6 + c] = y * d - z * b, z * a - x * d, x * b - y * a

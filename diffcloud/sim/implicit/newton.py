@@ -136,11 +136,9 @@ def converge(work: Work) -> tuple[bool, Place, Room, float]:
 
 @kernel
 def _correct(steps: Floats, sizes: Floats, taken: int, direction: Floats) -> None:
-    """Correct the solution [D, 3] of a reused matrix by the steps taken since its factorisation.
-
-    This is Broyden's update of the inverse, from these steps alone (Kelley, Iterative Methods for Linear and Nonlinear
-    Equations, SIAM 1995, section 7.3). The direction still has the sign of the residual. `_judge` reverses it later.
-    """
+    """Correct the solution [D, 3] of a reused matrix by the steps taken since its factorisation. This is Broyden's update
+    of the inverse, from these steps alone (Kelley, Iterative Methods for Linear and Nonlinear Equations, SIAM 1995, section
+    7.3). The direction still has the sign of the residual. `_judge` reverses it later."""
     if taken == 0:
         return
     for k in range(taken - 1):
@@ -203,10 +201,8 @@ def _arrived(scenery: Floats, final: Floats) -> bool:
 
 @kernel
 def _pushed(work: Work, here: Place, left_over: Floats, found: Floats) -> None:
-    """The residual plus its first-order change as moving obstacles complete their motion.
-
-    Without this change, a step would not account for the obstacles. They would close the gap instead of pushing the cloth.
-    """
+    """The residual plus its first-order change as moving obstacles complete their motion. Without this change, a step would
+    not account for the obstacles. They would close the gap instead of pushing the cloth."""
     for i in range(len(found)):
         for axis in range(3):
             found[i, axis] = left_over[i, axis]

@@ -74,10 +74,8 @@ def cover(work: Work, room: Room, distance: float) -> None:
 
 @kernel
 def away(room: Room, points: Floats) -> float:
-    """Largest distance of a point from its path, if all points had covered the same fraction of their paths [m].
-
-    The fraction is the best fit. So points between two such sets are at most as far away as in the worse of both.
-    """
+    """Largest distance of a point from its path, if all points had covered the same fraction of their paths [m]. The
+    fraction is the best fit. So points between two such sets are at most as far away as in the worse of both."""
     begin, predicted = room.begin, room.predicted
     along, path = 0.0, 1e-300
     for i in range(len(points)):
@@ -115,10 +113,8 @@ def prescribed(
 
 @kernel
 def _list(work: Work, room: Room) -> None:
-    """List the room's pairs: those that can come closer than the thickness within it.
-
-    Pairs whose points are all prescribed are omitted.
-    """
+    """List the room's pairs: those that can come closer than the thickness within it. Pairs whose points are all prescribed
+    are omitted."""
     surface, law = work.surface, work.law
     begin, predicted, reached = room.begin, room.predicted, 2 * room.size
     point_face, edge_edge = candidates(surface, begin, predicted, reached + law[0, 1])
@@ -172,11 +168,8 @@ def distances_at(work: Work, room: Room, points: Floats) -> Floats:
 
 @kernel
 def free_way(work: Work, room: Room, distances: Floats, points: Floats, ends: Floats) -> float:
-    """Fraction in [0, 1] of the straight path from `points` to `ends` [N, 3] that is free of collisions.
-
-    Args:
-        distances: [C] distances of the room's pairs at `points`.
-    """
+    """Fraction in [0, 1] of the straight path from `points` to `ends` [N, 3] that is free of collisions. `distances` [C]
+    are those of the room's pairs at `points`."""
     planes, law = work.planes, work.law
     allowed = 1.0
     if len(planes.offsets) > 0:

@@ -43,11 +43,11 @@ class Scene(NamedTuple):
     pattern: Pattern
     """Sparsity pattern of the matrix, with V + 2 B rows."""
     time_step: float
-    """[s]"""
+    """Time step [s]."""
     second_order: bool
     """True: BDF2. False: backward Euler."""
     gravity: Floats
-    """[3] [m/s²]"""
+    """[3] gravitational acceleration [m/s²]."""
     surface: Surface
     planes: Planes
     law: Floats
@@ -179,9 +179,9 @@ class Past(NamedTuple):
     """The state before the current part, for BDF2."""
 
     positions: Floats
-    """[V, 3] [m]"""
+    """[V, 3] positions [m]."""
     velocities: Floats
-    """[V, 3] [m/s]"""
+    """[V, 3] velocities [m/s]."""
     length: Floats
     """[1] length of the part between both states, as a fraction of a step; 0 if there is no earlier state."""
 

@@ -22,4 +22,4 @@ CONTACTS: tuple[Term, ...] = (
 """Contact terms, whose point pairs each step detects."""
 
 kernels = integrator_kernels("implicit", TERMS, (), CONTACTS, (SPIN,))
-"""`kernels.jacobian`, `kernels.Terms`, `kernels.bending_force`, ..."""
+"""Module of the generated kernels, such as `kernels.jacobian`, `kernels.Terms` and `kernels.bending_force`."""

@@ -31,9 +31,9 @@ class BodyState:
     orientation: Tensor
     """[B, N, 3, 3] rotation matrix from the body frame to the world frame."""
     velocity: Tensor
-    """[B, N, 3] [m/s]"""
+    """[B, N, 3] velocity of the centre of mass [m/s]."""
     angular_velocity: Tensor
-    """[B, N, 3] in the world frame [rad/s]."""
+    """[B, N, 3] angular velocity in the world frame [rad/s]."""
 
     def tensors(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         return self.centre, self.orientation, self.velocity, self.angular_velocity
@@ -48,7 +48,7 @@ class Bodies:
     body: NDArray[np.int64]
     """[P] index of the body of each point."""
     mass: NDArray[np.float64]
-    """[B] [kg]"""
+    """[B] mass of each body [kg]."""
     gyration: NDArray[np.float64]
     """[B, 3, 3] inertia per mass in the body frame [m²]."""
     start: NDArray[np.float64]

@@ -16,10 +16,10 @@ class RigidBody:
     mesh: SurfaceMesh
     """Closed mesh with outward faces, in the world frame at the start [m]."""
     density: float = 1000.0
-    """[kg/m³]; not used if `mass` is given."""
+    """Density [kg/m³]; not used if `mass` is given."""
     mass: float | None = None
-    """[kg]"""
+    """Mass [kg]; default density times volume."""
     velocity: Vector = (0.0, 0.0, 0.0)
-    """[m/s]"""
+    """Initial velocity of the centre of mass [m/s]."""
     angular_velocity: Vector = (0.0, 0.0, 0.0)
-    """[rad/s]"""
+    """Initial angular velocity in the world frame [rad/s]."""

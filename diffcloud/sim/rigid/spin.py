@@ -18,12 +18,8 @@ _SMALL = 1e-8
 
 
 def _spin(inputs: Sequence[Scalar], constants: Sequence[Scalar]) -> list[Scalar]:
-    """Return R₁ [9] and the change of angular momentum per mass [m²/s].
-
-    Args:
-        inputs: R₀ [9], ω₀ [3] and ω₁ [3].
-        constants: Δt and G [9].
-    """
+    """Return R₁ [9] and the change of angular momentum per mass [m²/s], for inputs (R₀ [9], ω₀ [3], ω₁ [3]) and constants
+    (Δt, G [9])."""
     before = [Vector(*inputs[3 * row : 3 * row + 3]) for row in range(3)]
     first, last = Vector(*inputs[9:12]), Vector(*inputs[12:15])
     gyration = [Vector(*constants[1 + 3 * row : 4 + 3 * row]) for row in range(3)]

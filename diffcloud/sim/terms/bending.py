@@ -98,11 +98,9 @@ TERM = Term(
     constants={"stiffness": (), "curvature": (), "rest_angle": (), "rows": (2, _COLUMNS)},
     parameters={"bending": "element"},
 )
-"""Nodes: edge n0, n1, then the two opposite nodes.
-
-Constants: stiffness l² / (4 (a0 + a1)) [-], which times k_b [N·m] gives K; table columns per radian; rest angle [rad];
-table row at the direction of each side, k_b over the curvature columns [N·m].
-"""
+"""Nodes: edge n0, n1, then the two opposite nodes. Constants: stiffness l² / (4 (a0 + a1)) [-], which times k_b [N·m] gives
+K; table columns per radian; rest angle [rad]; table row at the direction of each side, k_b over the curvature columns
+[N·m]."""
 
 
 def dihedral_angles(mesh: ClothMesh) -> NDArray[np.float64]:
@@ -143,10 +141,8 @@ def _table_value(hinge: Element, angle: Scalar) -> Scalar:
 
 
 def _rows_at(bending: NDArray[np.float64], angle: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Table rows [H, 2, 5] at edge directions [H, 2], interpolated from the table [3, 5].
-
-    As in ARCSim, rows are at half-pixel positions, reflected at -0.5 and 2.5, then clamped.
-    """
+    """Table rows [H, 2, 5] at edge directions [H, 2], interpolated from the table [3, 5]. As in ARCSim, rows are at
+    half-pixel positions, reflected at -0.5 and 2.5, then clamped."""
     row = (6 * angle / np.pi) % 6.0  # reflection at -0.5 and 2.5 makes the direction periodic with π
     row = np.clip(np.where(row > 3.0, 6.0 - row, row) - 0.5, 0.0, 2.0)
     low = np.minimum(row.astype(int), 1)

@@ -34,7 +34,7 @@ class Setup:
     handles: Handles
     bodies: Bodies
     integrator: str
-    """A key of `integrators.INTEGRATORS`."""
+    """Name of the integrator, a key of `integrators.INTEGRATORS`."""
     order: Order
     shaped: bool
     """Use the angles of the given mesh as rest angles of the hinges. Otherwise the cloth is flat at rest."""
@@ -54,11 +54,9 @@ class Elements:
 
 @dataclass(frozen=True, eq=False)
 class Term:
-    """A force term.
-
-    `force` returns the force [N] on each node of an element. It depends on the positions, and on the velocities at the
-    start and at the end of the step. An elastic force also depends on the displacement in which the step linearises it.
-    """
+    """A force term. `force` returns the force [N] on each node of an element. It depends on the positions, and on the
+    velocities at the start and at the end of the step. An elastic force also depends on the displacement in which the step
+    linearises it."""
 
     name: str
     corners: int
@@ -108,7 +106,7 @@ class Element:
         self.displacement = each("motion.displacement")
         """[n] displacement d in which elastic forces are linear: force = F(x) - H(x) d [m]."""
         self.time_step = graph.input("timing.time_step")
-        """[s]"""
+        """Length of the step [s]."""
         self.ahead = graph.input("timing.ahead")
         """Time from `positions` to the end of the step [s]: the time step or zero."""
 

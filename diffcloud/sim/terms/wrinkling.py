@@ -47,10 +47,8 @@ _COUPLED = 0.999
 _LEAST = 1e-9
 """Fraction of k0 + k2 that is added to k0, k2 and k3, so that C is positive."""
 _STEPS = 6
-"""Iterations of Newton's method from the direction of the largest strain to that of the wrinkles.
-
-They converged for 100,000 random strains of sheets with k3 from 0.3 to 4000 % of √(k0 k2), and ratios k0/k2 up to thirty.
-"""
+"""Iterations of Newton's method from the direction of the largest strain to that of the wrinkles. They converged for
+100,000 random strains of sheets with k3 from 0.3 to 4000 % of √(k0 k2), and ratios k0/k2 up to thirty."""
 _WIDEST = 1.0
 """Upper bound of a Newton step: tangent of the change of twice the direction's angle."""
 _TINY = 1e-24
@@ -143,12 +141,9 @@ class _Wrinkling:
 
 
 class _Slackening:
-    """r²(1 - r)³ for r < 1: the part of the kept energy r² that smoothing subtracts.
-
-    The difference is convex, and its second derivative rises from zero without a jump. At r = 1 it joins r² with two
-    continuous derivatives. `share` is the derivative with respect to r². `rate` is the derivative of `share` with respect
-    to r, divided by r.
-    """
+    """r²(1 - r)³ for r < 1: the part of the kept energy r² that smoothing subtracts. The difference is convex, and its
+    second derivative rises from zero without a jump. At r = 1 it joins r² with two continuous derivatives. `share` is the
+    derivative with respect to r². `rate` is the derivative of `share` with respect to r, divided by r."""
 
     def __init__(self, root: Scalar) -> None:
         r = where(root < 1.0, root, 1.0)
@@ -159,10 +154,8 @@ class _Slackening:
 
 
 class _Loss:
-    """Smoothed lost energy: the part of q² that is subtracted, where q² is the energy beyond the kept one.
-
-    Its second derivative with respect to q grows from 0 to 2 up to q = 1. `share` and `rate` are as in `_Slackening`.
-    """
+    """Smoothed lost energy: the part of q² that is subtracted, where q² is the energy beyond the kept one. Its second
+    derivative with respect to q grows from 0 to 2 up to q = 1. `share` and `rate` are as in `_Slackening`."""
 
     def __init__(self, root: Scalar) -> None:
         q, eased = root, root < 1.0
@@ -172,12 +165,8 @@ class _Loss:
 
 
 class _Pulled:
-    """Energy and stress of a wrinkled face: tension in the direction t of the largest e²/2y only.
-
-    Args:
-        strained: strain E.
-        compliance: coefficients of C⁻¹, in the order in which k0, k1, k2, k3 are those of C.
-    """
+    """Energy and stress of a wrinkled face: tension only in the direction t of the largest e²/2y. `compliance` has the
+    coefficients of C⁻¹, in the order of k0, k1, k2, k3."""
 
     def __init__(self, strained: Symmetric, compliance: Sequence[Scalar]) -> None:
         found = [held(one) for one in strained], [held(one) for one in compliance]
@@ -212,10 +201,8 @@ class _Pulled:
 
 
 class _Along:
-    """A direction t = (cos φ, sin φ) in the sheet, given by cos 2φ and sin 2φ, in which t tᵀ is linear.
-
-    Derivatives are with respect to 2φ. The derivative of e²/2y is (e/y²) `slope`, and the derivative of `slope` is `bend`.
-    """
+    """A direction t = (cos φ, sin φ) in the sheet, given by cos 2φ and sin 2φ, in which t tᵀ is linear. Derivatives are
+    with respect to 2φ. The derivative of e²/2y is (e/y²) `slope`, and the derivative of `slope` is `bend`."""
 
     def __init__(self, cosine: Scalar, sine: Scalar, strained: Sequence[Scalar], compliance: Sequence[Scalar]) -> None:
         along_u, along_v, between = 0.5 + 0.5 * cosine, 0.5 - 0.5 * cosine, 0.5 * sine
