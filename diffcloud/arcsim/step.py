@@ -142,7 +142,7 @@ def begin_motion(
 
 @kernel
 def displace(scene: Scene, parameters: Parameters, nodes: int, motion: Motion) -> None:
-    """Set the displacement in which elastic forces are linear: (Δt + β) v."""
+    """Set the displacement d = (Δt + β) v of the linearised elastic forces F - H d."""
     reach = scene.time_step + parameters.damping[0]
     for i in range(nodes):
         for axis in range(3):

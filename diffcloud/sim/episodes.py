@@ -185,7 +185,7 @@ class Batch:
 
         run_all([partial(job, entry) for entry in range(count)], look=look, stop=stop)
 
-    # --- what became of them -----------------------------------------------------------------------------------------
+    # --- failures ----------------------------------------------------------------------------------------------------
 
     def _failed(self, entry: int, outcome: Outcome) -> DivergedError:
         if outcome.status >= status.FIRST_OWN:

@@ -60,7 +60,7 @@ class Motion(NamedTuple):
     after: Floats
     """[N, 3] velocities at the end of the step [m/s]."""
     displacement: Floats
-    """[N, 3] displacement in which elastic forces are linear [m]."""
+    """[N, 3] displacement d of the linearised elastic forces F - H d [m]."""
 
 
 class Timing(NamedTuple):

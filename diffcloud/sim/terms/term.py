@@ -104,7 +104,7 @@ class Element:
         self.after = each("motion.after")
         """[n] node velocities at the end of the step [m/s]."""
         self.displacement = each("motion.displacement")
-        """[n] displacement d in which elastic forces are linear: force = F(x) - H(x) d [m]."""
+        """[n] displacement d of the linearised elastic forces F(x) - H(x) d [m]."""
         self.time_step = graph.input("timing.time_step")
         """Length of the step [s]."""
         self.ahead = graph.input("timing.ahead")

@@ -1,4 +1,4 @@
-"""Energy that wrinkles finer than the mesh remove from the compression energy of `stretching`.
+"""Reduction of the compression energy of `stretching` by wrinkles that are finer than the mesh.
 
     energy per face = (1 - c) a [W*(E) - W(E)],   W(E) = E:C:E / 2,   W*(E) = min over slack A ⪰ 0 of W(E + A)
 
