@@ -1,6 +1,6 @@
-"""Compatibility with ARCSim and DiffSim, which the published experiments used: their integrator, scene files and scenes.
+"""Compatibility with ARCSim and DiffSim, which the published experiments used: integrator, scene files and scenes.
 
-`sim.integrators` and `scene.registry` name this package's modules; nothing else in `sim` and `scene` does.
+Outside this package, only `sim.integrators` and `scene.registry` name its modules.
 
 The integrator is one linearised backward-Euler step, an equation for the velocity change u:
 
@@ -9,9 +9,9 @@ The integrator is one linearised backward-Euler step, an equation for the veloci
     f = F(x₀) - H(x₀) (x - x₀ + β v) + m g + f_air(x₀, v₀, v) - strength k_h (x - x*) + contact
 
 The equation is linear: ∂r/∂u is the assembled matrix. β is stiffness-proportional damping. Hard handles replace the rows of
-their nodes. (`implicit` has the converged step.)
+their nodes. (`sim.implicit` instead iterates each step to convergence.)
 
-`integrator` is what the simulation calls, `step` has the episode, `adjoint` and `tangent` its derivatives, `contact`
-repulsion, friction and impacts. `load` and `write` have the scene files, `schema` their fields, `release` the published
-experiments.
+`integrator` has the interface, `step` the loop over steps, `adjoint` and `tangent` its derivatives, and `contact`
+repulsion, friction and impacts. `load` and `write` process scene files, `schema` has their fields, and `release` the
+published experiments.
 """

@@ -41,7 +41,7 @@ def reverse(
     gradients: Parameters,
     track_gradients: Floats,
 ) -> None:
-    """Sweep the steps of an episode backwards.
+    """Propagate gradients backwards through an episode.
 
     Args:
         anchors, positions, velocities: as `simulate` left them.
@@ -62,7 +62,7 @@ def reverse(
         holder = holders(held, step, nodes)
         restore(scene, parameters, positions[step], velocities[step], kept.solved[step], motion)
         x, v = position_gradients[step], velocity_gradients[step]
-        after = velocity_gradients[step + 1]  # by the velocities at the end, then by those before contact
+        after = velocity_gradients[step + 1]  # first of the velocities at the end, then of those before contact
         start_gradient[:] = 0.0
         for i in range(nodes):
             for axis in range(3):
@@ -122,7 +122,7 @@ def reverse(
                 v[i, axis] += slopes.before[i, axis]
                 if holder[i] < 0:
                     v[i, axis] += slope
-                else:  # its velocity is (x* - x₀)/Δt
+                else:  # the velocity of a prescribed node is (x* - x₀)/Δt
                     gradients.target[holder[i], axis] += slope / dt
                     x[i, axis] -= slope / dt
         aim_reverse(held, step, gradients.target, anchor_gradient, track_gradients)
@@ -146,7 +146,7 @@ def restore(
 
 @kernel
 def candidates(scene: Scene, motion: Motion):  # type: ignore[no-untyped-def]
-    """([N, 3] points before the impacts of a step, [P, V] whether each plane left each node where it was)."""
+    """Return all points [N, 3] before the impacts of a step, and for each plane [P, V] whether it left a node in place."""
     nodes = len(scene.pattern.place)
     cloth = np.empty((nodes, 3))
     for i in range(nodes):
@@ -160,10 +160,8 @@ def candidates(scene: Scene, motion: Motion):  # type: ignore[no-untyped-def]
 
 @kernel
 def stop_at_planes(scene: Scene, above, places: Floats, backwards: int) -> None:  # type: ignore[no-untyped-def]
-    """Project vectors of nodes onto the planes that stop them: remove the component along each plane's normal.
-
-    Each projection is its own transpose. The transpose of their product is the product in reverse order (`backwards`).
-    """
+    """Project vectors of nodes onto the planes that stop them: remove the component along each plane's normal. Each
+    projection is its own transpose. The transpose of their product is the product in reverse order (`backwards`)."""
     count = len(above)
     for q in range(count):
         p = count - 1 - q if backwards > 0 else q
@@ -186,7 +184,7 @@ def factor_of(  # type: ignore[no-untyped-def]
     corners: Ints,
     constants: Floats,
 ):
-    """Return (pattern, factor) of a step's matrix. The factor is the kept one, or else computed again."""
+    """Return the pattern and the factor of a step's matrix. If the factor was not stored, it is computed again."""
     pattern, moved = pattern_with(scene.pattern, corners)
     begin, end = kept.begins[step, 4], kept.begins[step + 1, 4]
     if end > begin:

@@ -1,4 +1,4 @@
-"""The kernels' scene from a cloth and its surrounding."""
+"""Builds the constant scene data for the kernels."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from diffcloud.sim.terms.term import Setup
 
 
 def build_scene(setup: Setup, time_step: float) -> Scene:
-    """Everything constant in a run with steps so long [s]."""
+    """Build the data that are constant in a simulation with steps of `time_step` [s]."""
     surrounding, mesh = setup.surrounding, setup.mesh
     choices = surrounding.reference_contact
     numbers = surrounding.contact

@@ -22,7 +22,8 @@ from diffcloud.sim.terms.term import Setup
 
 
 class Arcsim:
-    """Linearised steps with lagged contact and impact zones. Obstacles stand still, so that it reads no scenery."""
+    """Linearised steps with lagged contact and impact zones. Only static obstacles are supported, so `Episode.scenery` is
+    unused."""
 
     name = "arcsim"
     terms = TERMS
@@ -40,7 +41,7 @@ class Arcsim:
     def resting_height(self, contact: ContactSettings, weight: float) -> float:
         if not contact.stiffness:
             return 0.0
-        load = 2 * weight / (contact.stiffness * contact.repulsion_thickness)  # (1 - d/τ)²; 0 above what it can carry
+        load = 2 * weight / (contact.stiffness * contact.repulsion_thickness)  # (1 - d/τ)²; above 1: too soft
         return contact.repulsion_thickness * max(1 - math.sqrt(load), 0.0)
 
     def build(self, setup: Setup, time_step: float) -> Scene:

@@ -1,4 +1,4 @@
-"""Load an ARCSim/DiffSim scene JSON."""
+"""Loads scenes from ARCSim/DiffSim JSON files."""
 
 from __future__ import annotations
 
@@ -26,21 +26,20 @@ from diffcloud.sim.scenery import MovingObstacle
 from diffcloud.sim.surrounding import ContactSettings, ReferenceContact, Surrounding
 
 _SUPPORTED_SWITCHES = {"remeshing", "proximity", "strainlimiting", "separation", "popfilter", "plasticity"}
-"""Of `disable`: those whose stage this simulator has (proximity), or never runs anyway."""
+"""Supported values of `disable`: stages that this simulator has (proximity) or never runs."""
 
 
 def load_scene(path: Path, *, reload_materials: bool = False) -> Scene:
-    """Read a scene file; mesh and material paths are relative to the nearest folder above it that holds them.
+    """Read a scene file. Mesh and material paths are relative to the nearest parent folder that contains them.
 
     Args:
-        reload_materials: reproduce what the published DiffCloud experiments do: they read the material tables a second
-            time after the masses were computed, which drops `thicken` and the multipliers from stretching and bending
-            but keeps them in the masses.
+        reload_materials: reproduce the published DiffCloud experiments. They read the material tables again after the
+            masses were computed. So `thicken` and the multipliers affect the masses, but not stretching and bending.
 
     Raises:
-        SceneError: an unreadable file, an unknown or unsupported field (by name), a path that leaves the scene's
-            folder, a reference to a motion or node that does not exist, or obstacles that contradict themselves.
-        MeshError: a mesh that is missing or cannot be simulated.
+        SceneError: an unreadable file, an unknown or unsupported field, a path outside the scene's folder, a reference to a
+            motion or node that does not exist, or contradictory obstacle settings.
+        MeshError: a mesh is missing or cannot be simulated.
     """
     path = Path(path)
     data = read_json(path, error=SceneError, comments=True)
@@ -130,7 +129,7 @@ def _refuse_unsupported(path: Path, scene: SceneFile) -> None:
 
 
 def _contradictions(block: ObstacleBlock, scene: SceneFile) -> Iterator[str]:
-    """What an obstacle's fields, each valid, say against each other."""
+    """Contradictions between the fields of an obstacle, each of which is valid alone."""
     given = block.model_fields_set
     if block.motion is None:
         for name in ("start_time", "end_time"):
@@ -190,7 +189,7 @@ def _handles(path: Path, scene: SceneFile, mesh: ClothMesh, motions: list[Motion
     handles, grasp = [], _grasp(scene)
     for index, block in enumerate(scene.handles):
         taken = step * max(1.0, np.ceil(block.start_time / step))
-        # later the published scenes have it
+        # In the published scenes, this happens only later.
         if block.motion is not None and np.allclose(motions[block.motion].at(np.array([taken]))[0], 0.0):
             raise SceneError(
                 f"{path}: handles.{index}.motion: motion {block.motion} has shrunk the cloth to a point when the handle "
@@ -211,7 +210,7 @@ def _handles(path: Path, scene: SceneFile, mesh: ClothMesh, motions: list[Motion
                 except SceneError as error:
                     raise SceneError(f"{path}: handles.{index}: {error}") from error
         motion = None if block.motion is None else motions[block.motion]
-        gripper = f"motion_{block.motion}" if several else "gripper"  # each motion is a gripper's
+        gripper = f"motion_{block.motion}" if several else "gripper"  # each motion belongs to one gripper
         one = Handle(0, motion, block.start_time, block.end_time, block.fade_time, gripper, pad)
         handles += [replace(one, node=node) for node in nodes]
     return tuple(handles)
@@ -259,7 +258,7 @@ def _transform_surface(mesh: SurfaceMesh, transform: TransformBlock) -> SurfaceM
 
 
 def _root(path: Path, mesh: str) -> Path:
-    """The nearest folder above the scene file that holds its mesh."""
+    """The nearest folder above the scene file that contains its mesh."""
     for folder in path.resolve().parents:
         if (folder / mesh).is_file():
             return folder
@@ -269,7 +268,7 @@ def _root(path: Path, mesh: str) -> Path:
 
 
 def _inside(root: Path, relative: str, scene: Path) -> Path:
-    """`root/relative`, refused if it leads out of `root`."""
+    """`root/relative`. Raise an error if it is outside `root`."""
     target = (root / PurePosixPath(relative)).resolve()
     if not target.is_relative_to(root.resolve()):
         raise SceneError(f"{scene}: the path {relative!r} leaves the scene's folder; it must lie below {root}.")

@@ -1,4 +1,4 @@
-"""The linear system of a step: forces and matrix of all terms and of the pairs that repel."""
+"""The linear system of a step: forces and matrix of all terms and of the repelling pairs."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _point_face_assemble, _edge_edge_assemble = (
 
 @kernel
 def repelling(reach: float, pattern: Pattern, corners: Ints, constants: Floats):  # type: ignore[no-untyped-def]
-    """The pairs that repel [C, 5] and their constants [C, 4] as elements (point-face, edge-edge), within a thickness
+    """Convert repelling pairs [C, 5] and their constants [C, 4] to elements (point-face, edge-edge), with thickness `reach`
     [m]."""
     edges = 0
     for c in range(len(corners)):
@@ -70,8 +70,8 @@ def repelling(reach: float, pattern: Pattern, corners: Ints, constants: Floats):
 
 @kernel
 def pattern_with(base: Pattern, corners: Ints) -> tuple[Pattern, Ints]:
-    """The pattern that also couples the nodes of pairs [C, 5], and where the base's blocks lie in it; empty: as they
-    are."""
+    """Extend the pattern by the couplings of pairs [C, 5]. Return it with the new positions of the base's blocks. The
+    positions are empty if nothing changed."""
     nodes = len(base.place)
     first, second = np.empty(6 * len(corners), np.int64), np.empty(6 * len(corners), np.int64)
     count = 0
@@ -99,7 +99,7 @@ def linear_system(  # type: ignore[no-untyped-def]
     moved: Ints,
     force: Floats,
 ):
-    """The step matrix m + Δt (Δt + β) H + handles + contact [A + 1, 9]; `force` [N, 3] takes the forces."""
+    """Assemble the step matrix m + Δt (Δt + β) H + handles + contact [A + 1, 9]; `force` [N, 3] receives the forces."""
     dt = scene.time_step
     timing = Timing(dt, dt)
     matrix = np.zeros((len(scene.pattern.rows) + 1, 9))

@@ -1,4 +1,4 @@
-"""What an episode of ARCSim's steps keeps for its derivatives."""
+"""Record of an episode of ARCSim's steps, for its derivatives."""
 
 from __future__ import annotations
 
@@ -14,25 +14,25 @@ from diffcloud.sim.compiled.pool import with_room
 
 
 class Kept(NamedTuple):
-    """What an episode's derivatives need of each step."""
+    """Data of each step that the derivatives need."""
 
     solved: Floats
     """[S, V, 3] velocities after the linear system, before contact [m/s]."""
     begins: Ints
-    """[S + 1, 5] the first row of each step in `corners`, `impacts.met`, `impacts.passes`, `impacts.forces`, `factors`. No
-    rows of `factors`: the step's factor is to be made again."""
+    """[S + 1, 5] first row of each step in `corners`, `impacts.met`, `impacts.passes`, `impacts.forces` and `factors`. A
+    step without rows in `factors` has its factor recomputed."""
     corners: Ints
-    """[., 5] kind and points of the pairs that repel."""
+    """[., 5] kind and points of the repelling pairs."""
     constants: Floats
-    """[., 4] sign, count, stiffness and whether an obstacle takes part."""
+    """[., 4] sign, count, stiffness, and 1 if an obstacle takes part."""
     impacts: Impacts
     factors: Floats
-    """[., 9]"""
+    """[., 9] blocks of the matrix factors."""
 
 
 @kernel
 def nothing_kept(steps: int, nodes: int) -> Kept:
-    """An empty record."""
+    """Create an empty record."""
     corners, constants, factors = np.empty((16, 5), np.int64), np.empty((16, 4)), np.empty((16, 9))
     begins = np.zeros((steps + 1, 5), np.int64)
     return Kept(np.empty((steps, nodes, 3)), begins, corners, constants, no_impacts(), factors)
@@ -40,7 +40,7 @@ def nothing_kept(steps: int, nodes: int) -> Kept:
 
 @kernel
 def remember(kept: Kept, step: int, solved: Floats, corners: Ints, constants: Floats, factor: Floats, limit: int) -> Kept:
-    """What a step adds to the record, but for its impacts."""
+    """Append a step to the record, except for its impacts."""
     copy_to(kept.solved[step], solved)
     begins = kept.begins
     pairs, rows = begins[step, 0], begins[step, 4]
@@ -61,7 +61,7 @@ def remember(kept: Kept, step: int, solved: Floats, corners: Ints, constants: Fl
 
 @kernel
 def with_impacts(kept: Kept, impacts: Impacts, step: int, keep: int) -> Kept:
-    """The record with the impacts of a step; without derivatives its room is used again."""
+    """Add the impacts of a step to the record. If derivatives are not needed, their memory is reused."""
     if keep >= 0:
         for k in range(3):
             kept.begins[step + 1, 1 + k] = impacts.used[k]

@@ -1,4 +1,4 @@
-"""The settings of the experiments published with the paper; their scenes come from the published JSON files."""
+"""Settings of the experiments published with the paper. Their scenes are in the published JSON files."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class ReleaseExperiment:
     learning_rate: float
     threshold: float
     first_frame: int
-    """State that the first recorded file is compared with: after this many steps."""
+    """Number of steps after which the state is compared with the first recorded file."""
     mass_nodes: tuple[int, ...] | None = None
     loss_faces: tuple[int, ...] | None = None
 
@@ -52,13 +52,13 @@ RELEASE = {
 
 
 def load_experiment(name: str, path: Path) -> Scenario:
-    """A published experiment on its scene file.
+    """Load a published experiment from its scene file.
 
     Args:
         name: a key of `RELEASE`.
 
     Raises:
-        SceneError, MeshError: what is wrong with the file, or that it belongs to another experiment.
+        SceneError, MeshError: the file is faulty, or belongs to another experiment.
     """
     settings = RELEASE[name]
     scene = load_scene(path, reload_materials=True)
@@ -80,6 +80,6 @@ def load_experiment(name: str, path: Path) -> Scenario:
         threshold=settings.threshold,
         length_unit_m=RELEASE_UNIT_M,
         first_frame_time=settings.first_frame * scene.frame_time,
-        # the published scripts use 0.05 in places; everything here is compared on one box
+        # The published scripts partly use 0.05. Here all experiments use the same bounds.
         bounds={"stretching": (0.1, 10.0), "density": (0.1, 10.0)},
     )

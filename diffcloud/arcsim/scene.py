@@ -1,4 +1,4 @@
-"""What the kernels of ARCSim's step are given."""
+"""Constant data for the kernels of ARCSim's step."""
 
 from __future__ import annotations
 
@@ -12,28 +12,28 @@ from diffcloud.sim.contact.surface import Surface
 from diffcloud.sim.status import FIRST_OWN
 
 NOT_POSITIVE_DEFINITE = FIRST_OWN
-"""A status: the step matrix cannot be factorised."""
+"""Status: the step matrix cannot be factorised."""
 UNRESOLVED = FIRST_OWN + 1
-"""A status: impacts that passes of detection and projection did not resolve."""
+"""Status: the passes of detection and projection did not resolve all impacts."""
 
 
 class Scene(NamedTuple):
-    """Everything constant in a run."""
+    """All data that are constant in a simulation."""
 
     terms: Any
-    """`kernels.Terms`"""
+    """Elements of the force terms (`kernels.Terms`)."""
     pattern: Pattern
     time_step: float
-    """[s]"""
+    """Time step [s]."""
     obstacles: Floats
     """[O, 3] points of static obstacles [m]."""
     plane_normals: Floats
-    """[P, 3] of half-spaces n · x >= offset, which stop nodes."""
+    """[P, 3] unit normals of the half-spaces n · x >= offset that stop nodes."""
     plane_offsets: Floats
-    """[P] [m]"""
+    """[P] offsets [m]."""
     surface: Surface
     repels: bool
-    """Whether pairs of meshes repel and rub."""
+    """Whether pairs of meshes repel each other, with friction."""
     collides: bool
     """Whether impacts between meshes are resolved."""
     repulsion: Repulsion

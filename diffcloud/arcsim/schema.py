@@ -1,6 +1,6 @@
-"""The ARCSim/DiffSim scene format. Fields are refused by name when unknown or unsupported, never ignored.
+"""The ARCSim/DiffSim scene format. Unknown or unsupported fields raise an error; they are never ignored.
 
-Defaults are ARCSim's. The blocks `diffcloud` are this project's own additions, for what ARCSim cannot say.
+Defaults are those of ARCSim. The blocks `diffcloud` are extensions of this project.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from diffcloud.io.schema import Checked, Component, FileName, Friction, NonNegat
 from diffcloud.sim.integrators import IntegratorName
 
 _MANY = 200
-"""Obstacles, handles or motions of a scene."""
+"""Largest number of obstacles, handles or motions of a scene."""
 Switch = Literal[
     "proximity", "physics", "strainlimiting", "collision", "remeshing", "separation", "popfilter", "plasticity"
 ]
@@ -24,7 +24,7 @@ class TransformBlock(Checked):
     translate: Vector = (0.0, 0.0, 0.0)
     scale: NonNegative = 1.0
     rotate: tuple[Component, Component, Component, Component] = (0.0, 1.0, 0.0, 0.0)
-    """Degrees, then the axis."""
+    """Angle [degrees], then the axis."""
 
 
 class MaterialBlock(Checked):
@@ -41,7 +41,7 @@ class ClothBlock(Checked):
     transform: TransformBlock = TransformBlock()
     materials: Annotated[list[MaterialBlock], Field(min_length=1, max_length=1)]
     remeshing: dict[str, Any] | None = None
-    """Accepted, and without effect, while remeshing is disabled."""
+    """Accepted, but has no effect, because remeshing must be disabled."""
 
 
 class KeyframeBlock(Checked):
@@ -60,27 +60,27 @@ class HandleBlock(Checked):
 
 
 class BodyBlock(Checked):
-    """What ARCSim cannot say of a movable obstacle."""
+    """Properties of a movable obstacle that ARCSim does not have."""
 
     density: Positive | None = None
-    """[kg/m³] Default: 1000, water's. ARCSim takes 0.01 kg for each node of the mesh, so that a finer mesh weighs more."""
+    """[kg/m³]. Default: 1000, as water. ARCSim uses 0.01 kg per node of the mesh, so a finer mesh is heavier."""
     mass: Positive | None = None
-    """[kg], instead of a density."""
+    """Mass instead of a density [kg]."""
     velocity: Vector = (0.0, 0.0, 0.0)
-    """Of the centre of mass at the start [m/s]."""
+    """Velocity of the centre of mass at the start [m/s]."""
     angular_velocity: Vector = (0.0, 0.0, 0.0)
-    """At the start, in the world's axes [rad/s]."""
+    """Angular velocity at the start, in the world frame [rad/s]."""
 
 
 class ObstacleBlock(Checked):
     mesh: FileName
     transform: TransformBlock = TransformBlock()
     movable: Literal[0, 1, False, True] | None = None
-    """Whether what it touches moves it. Default: 1, as in ARCSim, unless it has a motion."""
+    """Whether contact can move the obstacle. Default: 1, as in ARCSim, unless it has a motion."""
     motion: Annotated[int, Field(ge=0)] | None = None
-    """It acts on the transformed mesh."""
+    """Index of the motion, which acts on the transformed mesh."""
     start_time: Component = 0.0
-    """Before this and after `end_time` [s] the motion stands still, and so does the obstacle; in ARCSim it is absent."""
+    """Before this time and after `end_time` [s] the obstacle does not move. In ARCSim it is absent then."""
     end_time: float = Field(default=math.inf, gt=-math.inf, allow_inf_nan=True)
     diffcloud: BodyBlock = BodyBlock()
 
@@ -102,33 +102,34 @@ class MagicBlock(Checked):
     projection_thickness: Positive | None = None
     """Default: a tenth of the repulsion thickness."""
     edge_flip_threshold: Positive = 1e-2
-    """Of remeshing; without effect while that is disabled."""
+    """For remeshing only, so it has no effect."""
     rib_stiffening: Positive = 1.0
-    """Of remeshing's side effects; only 1 is supported."""
+    """For side effects of remeshing. Only 1 is supported."""
 
 
 class ExtensionBlock(Checked):
-    """What ARCSim cannot say."""
+    """Settings that ARCSim does not have."""
 
     hard_handles: bool = False
     integrator: IntegratorName | None = None
-    """"implicit": converged steps with smooth contact. Default: "arcsim", ARCSim's, unless an obstacle moves."""
+    """"implicit": steps iterated to convergence, with smooth contact. Default: "arcsim", unless an obstacle moves."""
     shaped: bool = False
-    """Whether hinges are at rest as the mesh stands, not flat."""
+    """Use the angles of the given mesh as rest angles of the hinges. Otherwise the cloth is flat at rest."""
     contact: Literal["meshes", "published", "planes"] = "meshes"
-    """Of the arcsim integrator: with all meshes and the cloth itself; the same with ARCSim's quirks, which the
-    published experiments need; or with planes only."""
+    """Contact of the arcsim integrator. "meshes": with all meshes and of the cloth with itself. "published": the same with
+    ARCSim's peculiarities, which the published experiments need. "planes": with planes only."""
     damping: NonNegative | None = None
     compression: Annotated[float, Field(ge=0, le=1)] = 1.0
-    """The part of its stretching stiffness with which the cloth resists compression in its plane."""
+    """Fraction of the stretching stiffness that resists compression."""
     added_mass: NonNegative = 0.0
-    """Of air that moves with the cloth, per area of it [kg/m²]."""
+    """Mass per area of the air that moves with the cloth [kg/m²]."""
     linear_drag: NonNegative = 0.0
-    """Beside `wind.drag`, in all directions [kg/(m²·s)]."""
+    """Linear drag in all directions, in addition to `wind.drag` [kg/(m²·s)]."""
     grip: Literal["pad", "pivot"] | None = None
-    """What a handle holds: a pad around a node, or of the nodes where it names several; or a pivot. Default: nodes."""
+    """What a handle holds. "pad": its nodes, or if it names one node, a square around it. "pivot": a node that can rotate.
+    Default: the nodes."""
     grip_m: Positive | None = None
-    """Side of the pad, or of the square that a pivot stands for. Default: 0.02."""
+    """Side of the pad, or of the square that a pivot represents [m]. Default: 0.02."""
 
     @model_validator(mode="after")
     def _has_a_grip_of_that_size(self) -> Self:

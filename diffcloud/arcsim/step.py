@@ -1,4 +1,4 @@
-"""An episode of ARCSim's steps: one linear system each, then what is in the way."""
+"""The loop over ARCSim's steps of an episode: one linear system per step, then contact."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from diffcloud.sim.held import Held, aim, first_anchors, holders, take_anchors
 from diffcloud.sim.status import DONE, INTERRUPTED, NOT_FINITE
 
 _LARGEST = 1e100
-"""[m] A coordinate beyond this is none any more: differences of its kind are not finite."""
+"""Coordinates larger than this count as non-finite, because their differences overflow [m]."""
 
 
 @kernel
@@ -34,18 +34,17 @@ def simulate(
     keep: int,
     control: Ints,
 ) -> tuple[int, int, Kept]:
-    """All steps of one cloth.
+    """Simulate all steps of one cloth.
 
     Args:
-        track: [S, G, 3] displacement of each gripper at the end of each step [m]; of any length where no handle follows
-            one.
-        anchors: [H, 3] takes those of the handles.
-        positions, velocities: [S + 1, V, 3] the first is the start; take the others.
-        keep: rows of factors that may be kept for the derivatives; below zero: nothing is kept.
-        control: [2] finished steps are added to the first; the second one stops the run when it is not zero.
+        track: [S, G, 3] displacement of each gripper at the end of each step [m]. Any length if no handle follows a track.
+        anchors: [H, 3] receives the anchors of the handles.
+        positions, velocities: [S + 1, V, 3] the first row is the initial state; receive the others.
+        keep: how many rows of factors may be stored for the derivatives; negative to store nothing.
+        control: [2] the first number counts finished steps. If another thread sets the second one, the run stops.
 
     Returns:
-        (how it ended (`status`), the step in which it did, what the derivatives need)
+        The status, the index of the step in which the run ended, and the record for the derivatives.
     """
     steps, nodes = len(positions) - 1, positions.shape[1]
     kept = nothing_kept(steps if keep >= 0 else 0, nodes)
@@ -80,7 +79,7 @@ def simulate(
         finite = True
         for i in range(nodes):
             for axis in range(3):
-                v = motion.after[i, axis] + change[i, axis]  # prescribed nodes have it already
+                v = motion.after[i, axis] + change[i, axis]  # already correct for prescribed nodes
                 velocities[step + 1, i, axis] = v
                 points[i, axis] = positions[step, i, axis] + scene.time_step * v
                 finite = finite and abs(points[i, axis]) < _LARGEST
@@ -92,7 +91,7 @@ def simulate(
         if scene.collides:
             mobile = mobility(parameters, holder)
             resolved, impacts = resolve(surface, near, scene.projection, motion.positions, points, mobile, kept.impacts)
-            if not resolved:  # the last of its impacts is what an error names
+            if not resolved:  # the last impact is named in the error
                 return UNRESOLVED, step, Kept(kept.solved, kept.begins, kept.corners, kept.constants, impacts, kept.factors)
             kept = with_impacts(kept, impacts, step, keep)
         for i in range(nodes):
@@ -106,7 +105,7 @@ def simulate(
 
 @kernel
 def with_obstacles(scene: Scene, cloth: Floats) -> Floats:
-    """[N, 3] all points, of the cloth's [V, 3]."""
+    """All points [N, 3]: cloth nodes [V, 3], then obstacles."""
     points = np.empty((len(cloth) + len(scene.obstacles), 3))
     copy_to(points[: len(cloth)], cloth)
     copy_to(points[len(cloth) :], scene.obstacles)
@@ -115,7 +114,7 @@ def with_obstacles(scene: Scene, cloth: Floats) -> Floats:
 
 @kernel
 def still(scene: Scene, nodes: int) -> Motion:
-    """Room for the motion of all points; obstacles rest."""
+    """Allocate the motion of all points, with obstacles at rest."""
     count = nodes + len(scene.obstacles)
     motion = Motion(np.zeros((count, 3)), np.zeros((count, 3)), np.zeros((count, 3)), np.zeros((count, 3)))
     copy_to(motion.positions[nodes:], scene.obstacles)
@@ -126,7 +125,7 @@ def still(scene: Scene, nodes: int) -> Motion:
 def begin_motion(
     scene: Scene, held: Held, parameters: Parameters, step: int, positions: Floats, velocities: Floats, motion: Motion
 ) -> None:
-    """The motion of a step before its linear system: as before, but for what handles prescribe."""
+    """Set the motion before a step's linear system: old velocities, except for nodes that handles prescribe."""
     dt = scene.time_step
     for i in range(len(positions)):
         for axis in range(3):
@@ -143,7 +142,7 @@ def begin_motion(
 
 @kernel
 def displace(scene: Scene, parameters: Parameters, nodes: int, motion: Motion) -> None:
-    """The displacement in which elastic forces are linear: (Δt + β) v."""
+    """Set the displacement d = (Δt + β) v of the linearised elastic forces F - H d."""
     reach = scene.time_step + parameters.damping[0]
     for i in range(nodes):
         for axis in range(3):
@@ -152,7 +151,7 @@ def displace(scene: Scene, parameters: Parameters, nodes: int, motion: Motion) -
 
 @kernel
 def project(scene: Scene, points: Floats, above) -> None:  # type: ignore[no-untyped-def]
-    """Put nodes that are behind a plane back above it; `above` bool [P, V] takes which of them were not."""
+    """Move nodes behind a plane to the projection thickness above it. `above` [P, V] receives True for the other nodes."""
     for p in range(len(scene.plane_offsets)):
         normal = scene.plane_normals[p]
         for i in range(above.shape[1]):
@@ -165,7 +164,7 @@ def project(scene: Scene, points: Floats, above) -> None:  # type: ignore[no-unt
 
 @kernel
 def mobility(parameters: Parameters, holder: Ints) -> Floats:
-    """[N] inverse masses of the impact stage: prescribed nodes do not give way."""
+    """Inverse masses [N] for the impacts; zero for prescribed nodes."""
     found = parameters.inverse_mass.copy()
     for i in range(len(holder)):
         if holder[i] >= 0:

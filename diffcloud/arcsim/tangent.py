@@ -1,5 +1,4 @@
-"""How an episode of ARCSim's steps changes along K directions, carried from its start to its end with the steps'
-factors."""
+"""Forward-mode derivatives of an episode of ARCSim's steps along K directions, with the factors of the steps."""
 
 from __future__ import annotations
 
@@ -37,13 +36,14 @@ def tangents(
     position_rates: Floats,
     velocity_rates: Floats,
 ) -> None:
-    """Carry rates along an episode.
+    """Propagate K directional derivatives through an episode.
 
     Args:
-        rates: of the parameters, with a leading axis K; its targets are overwritten.
-        track_rates: [K, S, G, 3]
+        rates: derivatives of the parameters, with a leading axis K. `target` is overwritten.
+        track_rates: [K, S, G, 3] derivatives of the track.
         anchors, positions, velocities: as `simulate` left them.
-        position_rates, velocity_rates: [S + 1, K, V, 3] the first rows are those of the start; take the others.
+        position_rates, velocity_rates: [S + 1, K, V, 3] the first rows are those of the initial state; the others are
+            filled.
     """
     dt = scene.time_step
     steps, nodes, directions = len(positions) - 1, positions.shape[1], position_rates.shape[1]

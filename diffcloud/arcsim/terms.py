@@ -1,4 +1,4 @@
-"""The forces of ARCSim's step, and the kernels that are generated from them (`sim.compiled.module`)."""
+"""Force terms of ARCSim's step, and the kernels generated from them (`sim.compiled.module`)."""
 
 from diffcloud.arcsim.contact.frames import EDGE_EDGE_MEETING, POINT_FACE_MEETING
 from diffcloud.arcsim.contact.planes import PLANES
@@ -8,9 +8,9 @@ from diffcloud.sim.terms import TERMS as SHARED
 from diffcloud.sim.terms.term import Term
 
 TERMS = (*SHARED, PLANES)
-"""Forces between nodes that are known before the motion."""
+"""Force terms whose elements are fixed before the simulation."""
 CONTACTS: tuple[Term, ...] = (PROXIMITY_POINT_FACE, PROXIMITY_EDGE_EDGE)
-"""Forces between points that each step finds."""
+"""Contact terms, whose point pairs each step detects."""
 
 kernels = integrator_kernels("arcsim", SHARED, (PLANES,), CONTACTS, (POINT_FACE_MEETING, EDGE_EDGE_MEETING))
-"""`kernels.assemble`, `kernels.Terms`, `kernels.bending_force`, ..."""
+"""Module of the generated kernels, such as `kernels.assemble`, `kernels.Terms` and `kernels.bending_force`."""

@@ -1,4 +1,4 @@
-"""Write a scene as ARCSim/DiffSim JSON with its meshes and material; loading it gives the same System."""
+"""Writes a scene as ARCSim/DiffSim JSON with its meshes and material. Loading it gives the same system."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from diffcloud.sim.motion import Motion
 from diffcloud.sim.surrounding import ContactSettings, ReferenceContact, Surrounding
 
 _Owned = tuple[str | None, Motion]
-"""A motion, and the gripper whose it is; None of an obstacle's."""
+"""Name of a gripper and its motion; the name is None for the motion of an obstacle."""
 
 
 def write_scene(scene: Scene, folder: Path, name: str = "scene") -> Path:
@@ -29,9 +29,9 @@ def write_scene(scene: Scene, folder: Path, name: str = "scene") -> Path:
         The path of the scene file.
 
     Raises:
-        SceneError: what the format cannot say: masses that come from another material than the tables (the published
-            experiments' reload), further forces, a gripper with several motions, contact of the arcsim integrator that is
-            none of the three that have a name, and some settings of the implicit integrator.
+        SceneError: the format cannot express the scene: masses from another material than the tables (as in the published
+            experiments), further forces, a gripper with several motions, contact options of the arcsim integrator without a
+            name, or some settings of the implicit integrator.
     """
     folder = Path(folder)
     if scene.mass_material is not None:
@@ -104,7 +104,7 @@ def write_scene(scene: Scene, folder: Path, name: str = "scene") -> Path:
         },
     }
     grasp = scene.handles.grasp
-    if grasp is not None and grasp.kind != "upright_pad":  # the motions of its nodes are all of that one
+    if grasp is not None and grasp.kind != "upright_pad":  # the motions of its nodes fully describe an upright pad
         data["diffcloud"] |= {"grip": grasp.kind, "grip_m": grasp.size}
     if math.isfinite(scene.end_time):
         data["end_time"] = scene.end_time
@@ -114,13 +114,13 @@ def write_scene(scene: Scene, folder: Path, name: str = "scene") -> Path:
 
 
 def _shared_grippers(scene: Scene) -> bool:
-    """Whether one gripper's handles have different motions: read again, each of these is a gripper."""
+    """Whether the handles of one gripper have different motions. Loading would make each motion a separate gripper."""
     moved = {(handle.gripper, handle.motion) for handle in scene.handles.handles if handle.motion is not None}
     return len(moved) > len({gripper for gripper, _ in moved})
 
 
 def _obstacles(around: Surrounding, motions: list[_Owned]) -> Iterator[tuple[SurfaceMesh, dict[str, Any]]]:
-    """Meshes and blocks; new motions are appended to the list."""
+    """Meshes and blocks of all obstacles. New motions are appended to `motions`."""
     for surface in around.obstacles:
         yield surface, {"movable": 0}
     for moving in around.moving:
@@ -133,7 +133,7 @@ def _obstacles(around: Surrounding, motions: list[_Owned]) -> Iterator[tuple[Sur
 
 
 def _number(motion: _Owned, motions: list[_Owned]) -> int:
-    """Of a motion in the list, to which it is appended if it is new; grippers share none, since each motion is one's."""
+    """Index of a motion in the list, to which it is appended if it is new. Grippers do not share motions."""
     if motion not in motions:
         motions.append(motion)
     return motions.index(motion)

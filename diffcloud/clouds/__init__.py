@@ -1,4 +1,4 @@
-"""Point clouds: sampling from meshes, training clouds, nearest neighbours, losses."""
+"""Point clouds: sampling from meshes, training clouds, nearest neighbours, and losses."""
 
 from diffcloud.clouds.augmentation import Augmentation, CloudMaker
 from diffcloud.clouds.background import Background

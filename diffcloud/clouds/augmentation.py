@@ -1,8 +1,8 @@
-"""Training clouds from simulated meshes, made unlike perfect ones as the paper does it (section IV-B).
+"""Augmented training clouds from simulated meshes, as in the paper (section IV-B).
 
-A cloud is drawn uniformly by area from a subset of the cloth's faces (occlusion) whose nodes are displaced by Gaussian
-noise (the sensor), together with the whole, undisturbed obstacle where the scenario has one. All random numbers are
-functions of a run's key (`keyed_random`): a cloud does not depend on the batch it is made in.
+A cloud is sampled uniformly by area from a subset of the cloth's faces (occlusion). Their nodes are displaced by Gaussian
+noise (sensor noise). If the scenario has an obstacle, the whole undisturbed obstacle is sampled too. All random numbers are
+functions of a run's key (`keyed_random`), so a cloud does not depend on its batch.
 """
 
 from __future__ import annotations
@@ -23,36 +23,37 @@ from diffcloud.io.simulated import SimulatedSet
 from diffcloud.mesh.topology import SurfaceMesh
 
 _SETTINGS, _NODES, _FACES, _POINTS, _PLACE = range(5)
-"""Streams of a run."""
+"""Numbers of the random streams of a run."""
 _CAMERAS_M, _PLACE_M = 0.004, 0.01
-"""Largest standard deviation of depth noise, and that of where a cloth lies [m]."""
+"""Largest standard deviation of the depth noise, and standard deviation of the cloth's position [m]."""
 _BEHIND_M = 0.01
-"""What is nearer to the middle of a face does not hide it [m]: the face itself, a layer that it lies on."""
+"""Surfaces closer than this to the centre of a face do not occlude it [m]: the face itself, or an adjacent layer."""
 _SPARE = 1.5
-"""Points drawn for each one needed where some may be the background's; where that is too few, points are repeated."""
+"""Sampled points per required point if background points are removed. If too few remain, points are repeated."""
 
 
 @dataclass(frozen=True)
 class Augmentation:
-    """How clouds differ from a uniform sample of the whole cloth. The defaults are the paper's.
+    """How clouds differ from a uniform sample of the whole cloth. The defaults are those of the paper.
 
     Raises:
-        ConfigError: a setting out of range.
+        ConfigError: a setting is out of range.
     """
 
     keep: tuple[float, float] = (0.7, 1.0)
-    """Range that each run's fraction of sampled faces is drawn from; which faces is random."""
+    """Each run samples a random fraction of the faces, uniform in this range. The choice of faces is random."""
     falling: bool = False
-    """Whether the fraction falls linearly over time, from all faces in the first frame to what is drawn in the last."""
+    """Whether the fraction decreases linearly over time, from all faces in the first frame to the sampled fraction in the
+    last."""
     jitter_m: float = 0.035 * 0.35
-    """Each run's node noise has a standard deviation drawn from [0, this] along each axis [m]."""
+    """Upper bound of each run's standard deviation of the node noise along each axis [m]. The lower bound is zero."""
     loss_faces_only: bool = True
-    """Whether only the faces of the loss are sampled where a scenario names them (the upper half of the fold)."""
+    """If the scenario names faces of the loss (the upper half of the fold), sample only these."""
     viewpoints: tuple[tuple[float, float, float], ...] = ()
-    """Of cameras, in the scene: only faces whose middle at least one of them sees are sampled; nothing but the cloth hides
-    it. Without, all may be."""
+    """Camera positions in the scene. Sample only faces whose centre at least one camera sees. Only the cloth occludes.
+    Empty: sample all faces."""
     shift_m: float = 0.0
-    """Standard deviation of each run's offset along x and along y [m]."""
+    """Standard deviation of each run's offset along x and y [m]."""
 
     def __post_init__(self) -> None:
         low, high = self.keep
@@ -67,30 +68,30 @@ class Augmentation:
 
     @staticmethod
     def none() -> Augmentation:
-        """Whole surfaces without noise, but for the choice of the loss's faces."""
+        """No augmentation, except for the choice of the loss's faces."""
         return Augmentation(keep=(1.0, 1.0), jitter_m=0.0)
 
     @staticmethod
     def recorded(viewpoints: tuple[tuple[float, float, float], ...]) -> Augmentation:
-        """What depth cameras see together of a cloth that was put down by hand."""
+        """What several depth cameras together see of a cloth that was placed by hand."""
         return Augmentation((1.0, 1.0), jitter_m=_CAMERAS_M, loss_faces_only=False, viewpoints=viewpoints, shift_m=_PLACE_M)
 
 
 @dataclass(frozen=True)
 class CloudMaker:
-    """Clouds of one scenario's meshes."""
+    """Makes clouds from the meshes of one scenario."""
 
     faces: Tensor
-    """[F, 3] the cloth's faces that may be sampled, then the obstacle's [O, 3]."""
+    """[F + O, 3] faces of the cloth that may be sampled, then those of the obstacle."""
     cloth_faces: int
-    """F"""
+    """Number F of faces of the cloth."""
     obstacle: Tensor
-    """[W, 3] the obstacle's points, numbered after the cloth's nodes."""
+    """[W, 3] points of the obstacle, numbered after the cloth's nodes."""
     points: int
     augmentation: Augmentation
     length_unit_m: float
     background: Background | None
-    """Left out of the clouds; then the obstacle is not sampled at all."""
+    """Body whose points are removed from the clouds. The obstacle is then not sampled."""
 
     @staticmethod
     def build(
@@ -101,13 +102,14 @@ class CloudMaker:
         background: Background | None = None,
         device: torch.device | str = "cpu",
     ) -> CloudMaker:
-        """
+        """Prepare the clouds of a simulated data set.
+
         Args:
-            points: of each cloud.
-            background: the set's obstacle, if it is to be left out, together with the cloth that touches it.
+            points: number of points of each cloud.
+            background: obstacle of the data set, to remove its points and the cloth points that touch it.
 
         Raises:
-            ConfigError: no points.
+            ConfigError: `points` is less than 1.
         """
         if points < 1:
             raise ConfigError(f"At least one point must be sampled, got {points}.")
@@ -128,8 +130,8 @@ class CloudMaker:
         )
 
     def seen(self, nodes: Tensor) -> Tensor | None:
-        """bool [B, T, F] which of the cloth's faces the viewpoints of the augmentation see of motions [B, T, V, 3]; None
-        without viewpoints."""
+        """Visibility of the cloth's faces from the augmentation's viewpoints, bool [B, T, F], for motions [B, T, V, 3].
+        None without viewpoints."""
         if not self.augmentation.viewpoints:
             return None
         eyes = torch.tensor(self.augmentation.viewpoints, dtype=torch.float64)[None]
@@ -139,15 +141,15 @@ class CloudMaker:
         return found.to(nodes.device)
 
     def clouds(self, nodes: Tensor, keys: Tensor, seen: Tensor | None = None) -> Tensor:
-        """Clouds of a batch of motions.
+        """Sample the clouds of a batch of motions.
 
         Args:
             nodes: float32 [B, T, V, 3].
             keys: int64 [B], one for each run (and epoch).
-            seen: what `seen` gives of them, where that is known already.
+            seen: result of `seen` for these motions, if already computed.
 
         Returns:
-            [B, T, points, 3], the points in random order.
+            [B, T, points, 3], points in random order.
         """
         batch, frames, count, _ = nodes.shape
         seen = self.seen(nodes) if seen is None else seen
@@ -168,17 +170,15 @@ class CloudMaker:
         weights = self._sampled_faces(fraction, keys, frames)
         if seen is not None:
             kept = weights[..., : self.cloth_faces] * seen
-            weights[..., : self.cloth_faces] = torch.where(kept.any(-1, keepdim=True), kept, 1.0)  # something must be
+            weights[..., : self.cloth_faces] = torch.where(kept.any(-1, keepdim=True), kept, 1.0)  # none seen: all
         found = points_on_faces(flat, self.faces, choice, place, weights=weights.flatten(0, 1))
         if self.background is not None:
             found = self.background.first_free(found, self.points)
         return found.view(batch, frames, self.points, 3)
 
     def _sampled_faces(self, fraction: Tensor, keys: Tensor, frames: int) -> Tensor:
-        """float32 [B, T, F + O]: 1 for the faces that are sampled, 0 for the others.
-
-        A run's faces have one random order; each frame takes the first of it, so that what is hidden stays hidden.
-        """
+        """Weight of each face, float32 [B, T, F + O]: 1 if the face is sampled, else 0. Each run orders its faces at
+        random, and each frame uses the first ones. So hidden faces remain hidden."""
         low, high = self.augmentation.keep
         keep = low + (high - low) * fraction  # [B, 1]
         if self.augmentation.falling and frames > 1:
@@ -192,5 +192,5 @@ class CloudMaker:
 
 
 def run_keys(seed: int, epoch: int, runs: Tensor) -> Tensor:
-    """[B] keys for `CloudMaker.clouds` of runs (int64 [B]) in an epoch."""
+    """Keys [B] for `CloudMaker.clouds`, from runs (int64 [B]) and an epoch."""
     return stream_keys(seed, epoch, runs)

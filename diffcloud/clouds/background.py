@@ -1,7 +1,7 @@
-"""What stands still beside the cloth at a known place (the pole, the hook), taken out of clouds.
+"""Removes the points of a static body at a known position (the pole, the hook) from clouds.
 
-A network learns little from points that are the same in every cloud: of a cloud of the published band, three quarters show
-the pole.
+Points that are the same in every cloud contain little information for a network. In a cloud of the published band, three
+quarters of the points belong to the pole.
 """
 
 from __future__ import annotations
@@ -14,24 +14,24 @@ from torch import Tensor
 from diffcloud.mesh.topology import SurfaceMesh
 
 _PAIRS = 2**21
-"""Points times triangles that are measured at once: bounds the memory."""
+"""Upper bound of the number of points times triangles per batch, to limit the memory."""
 
 
 @dataclass(frozen=True)
 class Background:
-    """A body, and how near a point must be to count as the body's."""
+    """A body, and the distance within which points count as points of the body."""
 
     corners: Tensor
-    """[F, 3, 3] of the body's triangles."""
+    """[F, 3, 3] corners of the body's triangles."""
     reach: float
-    """[length unit]"""
+    """Distance [length unit of the scene]."""
 
     @staticmethod
     def build(body: SurfaceMesh, reach: float, *, device: torch.device | str = "cpu") -> Background:
         return Background(torch.as_tensor(body.nodes[body.faces], dtype=torch.float32, device=device), reach)
 
     def holds(self, points: Tensor) -> Tensor:
-        """bool [...] of float32 [..., 3]: nearer to the body than the reach."""
+        """Whether points [..., 3] are closer to the body than `reach`, bool [...]."""
         flat = points.reshape(-1, 3)
         box = self.corners.reshape(-1, 3)
         around = ((flat >= box.amin(0) - self.reach) & (flat <= box.amax(0) + self.reach)).all(-1).nonzero()[:, 0]
@@ -41,8 +41,8 @@ class Background:
         return held.view(points.shape[:-1])
 
     def first_free(self, points: Tensor, count: int) -> Tensor:
-        """The first points [..., count, 3] of [..., N, 3] that are not the body's. Where there are fewer they are repeated;
-        where there is none, the body's are taken."""
+        """The first `count` points [..., count, 3] of [..., N, 3] that do not belong to the body. If there are fewer, they
+        are repeated. If there are none, points of the body are returned."""
         held = self.holds(points)
         order = held.to(torch.uint8).argsort(dim=-1, stable=True)
         free = (~held).sum(-1, keepdim=True)
@@ -52,13 +52,13 @@ class Background:
 
 
 def squared_triangle_distances(points: Tensor, corners: Tensor) -> Tensor:
-    """[N, F] squared distances from points [N, 3] to triangles [F, 3, 3], which must have an area."""
-    edges = corners.roll(-1, dims=1) - corners  # [F, 3, 3] from each corner to the next
+    """Squared distances [N, F] from points [N, 3] to triangles [F, 3, 3], which must have a nonzero area."""
+    edges = corners.roll(-1, dims=1) - corners  # [F, 3, 3] vectors from each corner to the next
     normal = torch.linalg.cross(edges[:, 0], edges[:, 1])  # [F, 3]
     from_corner = points[:, None, None] - corners  # [N, F, 3, 3]
     along = ((from_corner * edges).sum(-1) / edges.square().sum(-1)).clamp(0, 1)
     to_edges = (from_corner - along[..., None] * edges).square().sum(-1).amin(-1)
-    # inside where the point is on the inner side of all three edges' planes
+    # A point is inside if it is on the inner side of the planes through all three edges.
     inner = torch.linalg.cross(normal[:, None].expand_as(edges), edges)  # [F, 3, 3]
     inside = ((from_corner * inner).sum(-1) >= 0).all(-1)
     height = (from_corner[:, :, 0] * normal).sum(-1).square() / normal.square().sum(-1)

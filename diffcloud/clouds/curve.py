@@ -1,6 +1,6 @@
-"""The order of points along a Hilbert curve: neighbours in the order are neighbours in space.
+"""Order of points along a Hilbert curve, so that neighbours in the order are neighbours in space.
 
-The curve's turns are those of Hamilton, "Compact Hilbert indices" (2006), as a table of 12 states.
+The state table of the curve follows Hamilton, "Compact Hilbert indices" (2006). It has 12 states.
 """
 
 from __future__ import annotations
@@ -15,23 +15,24 @@ Ints = NDArray[np.int64]
 
 _BITS = 10
 _CELLS = 1 << _BITS
-"""Along the longest side of the points' box."""
+"""Number of cells along the longest side of the points' bounding box."""
 
 
 def _rotated(bits: int, by: int) -> int:
-    """Three bits turned to the right."""
+    """Rotate three bits to the right."""
     by %= 3
     return (bits >> by | bits << (3 - by)) & 7
 
 
 def _curve_tables() -> tuple[Ints, Ints]:
-    """[8 S] of each octant in each of S states its place along the curve, and where the next state's octants begin."""
+    """For each octant in each of S states [8 S]: its position along the curve, and the start of the next state's
+    octants."""
     gray = [i ^ i >> 1 for i in range(8)]
     entry = [0, 0, 0, 3, 3, 6, 6, 5]  # the corner at which the curve enters the w-th octant
     direction = [0, 1, 1, 2, 2, 1, 1, 0]  # the axis along which it crosses it
     states = [(0, 0)]
     places, following = [], []
-    for corner, axis in states:  # grows
+    for corner, axis in states:  # the list grows in the loop
         for octant in range(8):
             place = gray.index(_rotated(octant ^ corner, axis + 1))
             state = (corner ^ _rotated(entry[place], -axis - 1), (axis + direction[place] + 1) % 3)
@@ -47,26 +48,26 @@ _PLACE, _NEXT = _curve_tables()
 
 @kernel
 def larger(a: float, b: float) -> float:
-    """Of two numbers that are not NaN; the built-in one looks for it."""
+    """The larger of two numbers that are not NaN. Faster than the built-in function, which checks for NaN."""
     return a if a > b else b
 
 
 @kernel
 def smaller(a: float, b: float) -> float:
-    """Of two numbers that are not NaN."""
+    """The smaller of two numbers that are not NaN."""
     return a if a < b else b
 
 
 @kernel
 def _cell(offset: float, scale: float) -> int:
-    """The cell along one axis; what overflows goes to the first, where it is found as well, if more slowly."""
+    """Cell index along one axis. Overflowing values get cell 0, where the search still finds them, but more slowly."""
     place = offset * scale
     return int(place) if 0 <= place < _CELLS else 0
 
 
 @kernel
 def _along_curve(x: int, y: int, z: int) -> int:
-    """The place of a cell along the curve."""
+    """Position of a cell along the curve."""
     place = state = 0
     for bit in range(_BITS - 1, -1, -1):
         octant = state + ((x >> bit) & 1 | ((y >> bit) & 1) << 1 | ((z >> bit) & 1) << 2)
@@ -77,7 +78,7 @@ def _along_curve(x: int, y: int, z: int) -> int:
 
 @kernel
 def curve_order(points: Floats) -> Ints:
-    """[P, 3] -> [at most P] numbers of the finite points, along the curve through their box (a radix sort)."""
+    """Indices [at most P] of the finite points among points [P, 3], in order along the curve (radix sort)."""
     order, other = np.empty(len(points), np.int64), np.empty(len(points), np.int64)
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
     count = 0

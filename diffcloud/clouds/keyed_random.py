@@ -1,7 +1,7 @@
-"""Random numbers as a function of a key and a position: a batch of independent streams without a generator for each.
+"""Random numbers as functions of a key and a position: independent streams without generator objects.
 
-SplitMix64 (Steele, Lea & Flood 2014) over key + n · golden ratio, in 64-bit integers, so that a stream is the same whatever
-the batch it is drawn in, the process, and the device.
+Uses SplitMix64 (Steele, Lea & Flood 2014) on key + n · golden ratio, in 64-bit integers. So a stream does not depend on the
+batch, the process or the device.
 """
 
 from __future__ import annotations
@@ -14,11 +14,12 @@ from torch import Tensor
 _GOLDEN = 0x9E3779B97F4A7C15 - 2**64
 _FIRST, _SECOND = 0xBF58476D1CE4E5B9 - 2**64, 0x94D049BB133111EB - 2**64
 _BITS = 21
-"""Of each number: a word of 64 bits gives three, finer than a float32 resolves a place on a face."""
+"""Bits per number. A 64-bit word gives three numbers, which is more precise than a float32 position on a face."""
 
 
 def stream_keys(*parts: Tensor | int) -> Tensor:
-    """[B] int64 keys, one for each combination of `parts` (whole numbers, or tensors [B] of them); their order counts."""
+    """Keys [B] (int64), one for each combination of `parts` (integers, or tensors [B] of them). The order of the parts
+    matters."""
     key = torch.zeros((), dtype=torch.int64)
     for part in parts:
         key = _mix((torch.as_tensor(part, dtype=torch.int64) ^ key) + _GOLDEN)
@@ -26,7 +27,7 @@ def stream_keys(*parts: Tensor | int) -> Tensor:
 
 
 def uniform(keys: Tensor, count: int) -> Tensor:
-    """[B] keys -> float32 [B, count, 3] in [0, 1)."""
+    """Uniform numbers in [0, 1), float32 [B, count, 3], for keys [B]."""
     position = torch.arange(1, count + 1, device=keys.device) * _GOLDEN
     words = _mix(keys[:, None] + position)
     numbers = torch.stack([words >> 1, words >> 1 + _BITS, words >> 1 + 2 * _BITS], dim=-1)
@@ -34,14 +35,14 @@ def uniform(keys: Tensor, count: int) -> Tensor:
 
 
 def normal(keys: Tensor, count: int) -> Tensor:
-    """[B] keys -> float32 [B, count, 3], standard normal (Box & Muller)."""
+    """Standard normal numbers, float32 [B, count, 3], for keys [B] (Box & Muller)."""
     first, second = uniform(keys, 2 * count).split(count, dim=1)
     radius = torch.log1p(-first).mul_(-2).sqrt_()  # finite: 1 - u is never zero
     return radius * second.mul_(2 * math.pi).cos_()
 
 
 def _mix(words: Tensor) -> Tensor:
-    """The finaliser, in place."""
+    """Output function of SplitMix64, in place."""
     words ^= _shifted(words, 30)
     words *= _FIRST
     words ^= _shifted(words, 27)
@@ -51,5 +52,5 @@ def _mix(words: Tensor) -> Tensor:
 
 
 def _shifted(words: Tensor, places: int) -> Tensor:
-    """Logical shift to the right; torch's own keeps the sign."""
+    """Logical right shift. (torch's operator keeps the sign.)"""
     return (words >> places).bitwise_and_(2 ** (64 - places) - 1)

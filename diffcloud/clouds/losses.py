@@ -17,22 +17,22 @@ from diffcloud.clouds.neighbours import NeighbourIndex
 
 
 def one_sided_chamfer(source: Tensor, target: NeighbourIndex) -> Tensor:
-    """[..., N, 3] source clouds against one target -> [...] mean squared distance [m²]."""
+    """Mean squared distance [...] from the points of source clouds [..., N, 3] to one target [m²]."""
     return (source - target.nearest(source)).square().sum(-1).mean(-1)
 
 
 def chamfer(source: Tensor, targets: Sequence[NeighbourIndex]) -> Tensor:
-    """Two-sided distance of a batch of clouds to a ragged batch of targets.
+    """Two-sided Chamfer distance between a batch of clouds and targets of different lengths.
 
     Args:
         source: [B, N, 3].
-        targets: B targets, each of its own length; their points are differentiable too.
+        targets: B targets. Their points are differentiable too.
 
     Returns:
         [B] [m²].
     """
     values = []
-    for cloud, target in zip(source, targets, strict=True):  # ragged: one target at a time
+    for cloud, target in zip(source, targets, strict=True):  # targets differ in length, so one at a time
         back = NeighbourIndex(cloud)
         points = target.points.to(cloud)
         forth = (cloud - target.nearest_to(back)).square().sum(-1).mean()

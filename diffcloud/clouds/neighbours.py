@@ -17,24 +17,25 @@ if TYPE_CHECKING:
 
 
 _NEIGHBOURS = 12
-"""Whose plane gives a point's normal."""
+"""Number of neighbours for the plane that gives a point's normal."""
 _FEWEST = 3
-"""Points of a plane."""
+"""Smallest number of points that define a plane."""
 _UNCLEAR = 1e-2
-"""Of the squared size of a group's spread: a shorter cross product of its rows hardly has a direction."""
+"""Cross products shorter than this fraction of the squared spread of a group have no accurate direction."""
 _NO_GUESS = np.empty(0, np.int64)
 
 
 class NeighbourIndex:
-    """A target cloud that answers nearest-neighbour queries. Its search tree is built once, on first use."""
+    """Nearest-neighbour index of a target cloud. The search tree is built on first use."""
 
     def __init__(self, points: Tensor) -> None:
-        """
+        """Check and store the cloud.
+
         Args:
             points: [P, 3], finite, at least one.
 
         Raises:
-            EpisodeError: an empty cloud, a wrong shape, or NaN/Inf points.
+            EpisodeError: the cloud is empty, has the wrong shape, or contains NaN or infinite points.
         """
         if points.dim() != 2 or points.shape[1] != 3 or len(points) == 0:
             raise EpisodeError(f"A target cloud has shape [points, 3] with at least one point, got {list(points.shape)}.")
@@ -44,8 +45,8 @@ class NeighbourIndex:
 
     @cached_property
     def normals(self) -> Tensor:
-        """[P, 3] unit normals of the surface that the points were taken from, by the plane through each one's neighbours;
-        their signs mean nothing. Of fewer than three points: zero."""
+        """Unit normals [P, 3] of the sampled surface, from the plane through each point's neighbours. Their signs are
+        arbitrary. Zero if there are fewer than three points."""
         index = self._beside[1]
         if index.shape[1] < _FEWEST:
             return torch.zeros_like(self.points)
@@ -53,15 +54,15 @@ class NeighbourIndex:
 
     @cached_property
     def spacing(self) -> float:
-        """Median distance between neighbours [m]; zero of fewer than three points."""
+        """Median distance of neighbouring points [m]; zero if there are fewer than three points."""
         distance = self._beside[0]
         return 0.0 if distance.shape[1] < _FEWEST else float(np.median(distance[:, 1]))
 
     @property
     def from_surface(self) -> tuple[float, float]:
-        """Mean squared distances [m²] from a place of the surface to the nearest point, and from a point to the surface:
-        places are points dropped onto the plane of their neighbours, and each one's own point does not count. Zero of fewer
-        than three points."""
+        """Mean squared distances [m²] from the surface to the nearest point, and from a point to the surface. Surface
+        positions are points projected to the plane of their neighbours, and a point is not its own neighbour. Zero if there
+        are fewer than three points."""
         index = self._beside[1]
         if index.shape[1] < _FEWEST:
             return 0.0, 0.0
@@ -74,7 +75,7 @@ class NeighbourIndex:
 
     @cached_property
     def _beside(self) -> tuple[Floats, Ints]:
-        """[P, n] distances to the nearest points, itself first, and their numbers."""
+        """Distances [P, n] to the nearest points, starting with the point itself, and their indices."""
         from scipy.spatial import cKDTree  # slow to import, and only fits need it
 
         points = _as_array(self.points)
@@ -93,13 +94,12 @@ class NeighbourIndex:
         return torch.from_numpy(find_nearest(queries, order, guesses, self._tree))
 
     def nearest_index(self, queries: Tensor, guesses: Tensor | None = None) -> Tensor:
-        """[..., 3] -> [...] index of the nearest target point, the lowest of equally near ones.
+        """Index [...] of the nearest target point for queries [..., 3], the lowest index of equally near ones.
 
-        Distances are computed in float64. A query that is NaN or infinite has no neighbour and gets index 0: its
-        distance is NaN or infinite by itself.
+        Distances are computed in float64. A query that is NaN or infinite gets index 0, so its distance is NaN or infinite.
 
         Args:
-            guesses: [...] what was nearest to queries that lay near these; it saves time, and changes nothing.
+            guesses: [...] nearest points of similar queries. They save time, but do not change the result.
         """
         from diffcloud.clouds.curve import curve_order
 
@@ -108,17 +108,18 @@ class NeighbourIndex:
         return self._find(flat, curve_order(flat), known).to(queries.device).view(queries.shape[:-1])
 
     def nearest(self, queries: Tensor) -> Tensor:
-        """[..., 3] -> [..., 3]: the nearest target point of each query, in the queries' dtype."""
+        """Nearest target point [..., 3] of each query [..., 3], in the queries' dtype."""
         return self.points.to(queries)[self.nearest_index(queries)]
 
     def nearest_to(self, other: NeighbourIndex) -> Tensor:
-        """[P', 3] the nearest target point of each point of another cloud, whose own tree has them in order already."""
+        """Nearest target point [P', 3] of each point of another cloud. Fast, because the other cloud's tree has sorted its
+        points."""
         found = self._find(_as_array(other.points), other._tree.order, _NO_GUESS)
         return self.points.to(other.points)[found.to(other.points.device)]
 
 
 def compile_neighbours() -> None:
-    """Compile what queries need."""
+    """Compile the kernels for queries."""
     index = NeighbourIndex(torch.zeros((1, 3), dtype=torch.float64))
     index.nearest(index.points)
 
@@ -128,11 +129,9 @@ def _as_array(points: Tensor) -> Floats:
 
 
 def flattest_directions(points: Floats, groups: Ints) -> Floats:
-    """[G, 3] the unit directions along which groups [G, n] of points [P, 3] spread least.
-
-    Eigenvectors of 3 × 3 matrices in closed form (Smith 1961), five times as fast as a solver's; by the solver where two
-    spreads are about equal, as of points on a line.
-    """
+    """Unit directions [G, 3] of the smallest spread of groups [G, n] of points [P, 3]. Eigenvectors of 3 × 3 matrices in
+    closed form (Smith 1961), five times as fast as a general solver. The solver is used if two spreads are almost equal,
+    for example for points on a line."""
     x, y, z = (np.ascontiguousarray(column)[groups] for column in points.T)
     for part in (x, y, z):
         part -= part.mean(axis=1, keepdims=True)

@@ -1,9 +1,9 @@
 """Differentiable point sampling on triangle meshes (paper, section III-B).
 
-A point is x = u p1 + v p2 + w p3 on a face drawn with probability proportional to its world-space area, so its
-derivative by the corners is exactly (u, v, w). The random numbers are drawn once, when the sampler is made (common random
-numbers): the loss is then a deterministic function of the node positions. Face choice follows the areas but is not
-differentiated, as in the paper.
+A point is x = u p1 + v p2 + w p3 on a face that is chosen with probability proportional to its area in world space. So its
+derivative with respect to the corners is exactly (u, v, w). Random numbers are sampled once, when the sampler is made
+(common random numbers). So the loss is a deterministic function of the node positions. The choice of faces depends on the
+areas, but is not differentiated, as in the paper.
 """
 
 from __future__ import annotations
@@ -20,19 +20,20 @@ _TINY = 1e-30
 
 @dataclass(frozen=True)
 class SurfacePoints:
-    """Points that stay in their places on the faces of a mesh, however its nodes move."""
+    """Points at fixed barycentric positions on the faces of a mesh."""
 
     nodes: Tensor
-    """[..., N, 3] the corners of each one's face."""
+    """[..., N, 3] nodes of each point's face."""
     barycentric: Tensor
-    """[..., N, 3] its place among them."""
+    """[..., N, 3] barycentric coordinates of each point."""
 
     def of(self, values: Tensor) -> Tensor:
-        """[..., V, 3] positions of the nodes, or their rates -> [..., N, 3] those of the points. Differentiable."""
+        """Positions of the points [..., N, 3], or their derivatives, from those of the nodes [..., V, 3].
+        Differentiable."""
         return (self.barycentric[..., None, :] @ self.corners(values)).squeeze(-2)
 
     def corners(self, values: Tensor) -> Tensor:
-        """[..., N, 3, 3] of each one's face, of values [..., V, 3]."""
+        """Values [..., N, 3, 3] at the corners of each point's face, from node values [..., V, 3]."""
         flat = values.reshape(-1, *values.shape[-2:])
         nodes = self.nodes.reshape(len(flat), -1, 1).expand(-1, -1, 3)
         return flat.gather(1, nodes).reshape(*self.nodes.shape, 3)
@@ -40,14 +41,14 @@ class SurfacePoints:
 
 @dataclass(frozen=True)
 class SurfaceSampler:
-    """Draws N points on the surface of a mesh."""
+    """Samples N points on the surface of a mesh."""
 
     faces: Tensor
     """[F, 3] node indices of the faces that may be sampled."""
     choice: Tensor
-    """[N] in [0, 1): picks the face, stratified so that each face gets its share."""
+    """[N] in [0, 1): selects the face, stratified so that each face gets its share."""
     barycentric: Tensor
-    """[N, 3] (u, v, w), uniform on the triangle."""
+    """[N, 3] barycentric coordinates (u, v, w), uniform on the triangle."""
 
     @staticmethod
     def build(
@@ -58,12 +59,12 @@ class SurfaceSampler:
         subset: Tensor | None = None,
         dtype: torch.dtype = torch.float64,
     ) -> SurfaceSampler:
-        """Draw the random numbers.
+        """Sample the random numbers.
 
         Args:
             faces: [F, 3] node indices.
-            points: N.
-            generator: of the random numbers (on the CPU).
+            points: number N of points.
+            generator: random number generator on the CPU.
             subset: indices of the faces that may be sampled (the paper's occlusion heuristic); None for all.
 
         Raises:
@@ -82,7 +83,7 @@ class SurfaceSampler:
         return SurfaceSampler(faces, choice.to(device), uniform_barycentric(r1, r2).to(device))
 
     def draw(self, positions: Tensor) -> SurfacePoints:
-        """Points [..., N] on the mesh at node positions [..., V, 3]."""
+        """Sample points [..., N] on the mesh at node positions [..., V, 3]."""
         flat = positions.reshape(-1, *positions.shape[-2:])
         nodes = _choose(flat, self.faces, self.choice, None)
         return SurfacePoints(
@@ -90,20 +91,20 @@ class SurfaceSampler:
         )
 
     def sample(self, positions: Tensor) -> Tensor:
-        """[..., V, 3] node positions -> [..., N, 3] points."""
+        """Positions of the sampled points [..., N, 3], for node positions [..., V, 3]."""
         return self.draw(positions).of(positions)
 
 
 def points_on_faces(
     positions: Tensor, faces: Tensor, choice: Tensor, barycentric: Tensor, *, weights: Tensor | None = None
 ) -> Tensor:
-    """[B, V, 3] node positions -> [B, N, 3] points, on faces picked in proportion to their area.
+    """Points [B, N, 3] on faces that are chosen in proportion to their area, for node positions [B, V, 3].
 
     Args:
         faces: [F, 3] node indices.
-        choice: [N] or [B, N] in [0, 1): picks the face.
-        barycentric: [N, 3] or [B, N, 3] place on the face.
-        weights: [F] or [B, F] on top of the area; None for one.
+        choice: [N] or [B, N] in [0, 1): selects the face.
+        barycentric: [N, 3] or [B, N, 3] barycentric coordinates on the face.
+        weights: [F] or [B, F] factors on the areas; None for 1.
     """
     nodes = _choose(positions, faces, choice, weights)
     return SurfacePoints(nodes, barycentric).of(positions)
@@ -111,7 +112,7 @@ def points_on_faces(
 
 @torch.no_grad()
 def _choose(positions: Tensor, faces: Tensor, choice: Tensor, weights: Tensor | None) -> Tensor:
-    """[B, N, 3] corners of the faces that are picked."""
+    """Nodes [B, N, 3] of the selected faces."""
     corner = positions[:, faces]
     area = torch.linalg.cross(corner[:, :, 1] - corner[:, :, 0], corner[:, :, 2] - corner[:, :, 0])
     area = area.square().sum(-1).sqrt().clamp(min=_TINY)
@@ -119,12 +120,12 @@ def _choose(positions: Tensor, faces: Tensor, choice: Tensor, weights: Tensor | 
         area = area * weights
     cumulative = area.cumsum(-1)
     face = torch.searchsorted(cumulative, choice * cumulative[:, -1:], right=True)
-    # rounding may pick the end of the list: the last face that can be picked at all lies where the sum stops growing
+    # Rounding can select the end of the list. The last face with a nonzero weight is where the sum stops growing.
     last = torch.searchsorted(cumulative, cumulative[:, -1:].contiguous())
     return faces[torch.minimum(face, last)]
 
 
 def uniform_barycentric(first: Tensor, second: Tensor) -> Tensor:
-    """Two uniform numbers [...] in [0, 1) -> [..., 3] places (u, v, w), uniform on a triangle."""
+    """Barycentric coordinates (u, v, w) [..., 3], uniform on a triangle, from two uniform numbers [...] in [0, 1)."""
     root = first.sqrt()
     return torch.stack([1 - root, root * (1 - second), root * second], dim=-1)

@@ -1,11 +1,11 @@
-"""The place on a triangle mesh nearest to a point, and whether a mesh hides a point, exactly, in kernels.
+"""Nearest points on triangle meshes, and occlusion by meshes, computed exactly in kernels.
 
-Faces are taken in groups of eight neighbours. Those of a group are looked at only where the sphere around them comes near
-enough: nearer than the nearest place found so far, which begins with a guess or the face of the query before; or as near to
-the line of sight as its radius. Of those, a face whose plane, or a line through an edge of it, is farther away is left out.
+Faces are grouped by eight neighbours. A group is skipped unless its bounding sphere is close enough. For the nearest point,
+it must be closer than the best point so far, which starts with a guess or the face of the previous query. For occlusion, it
+must touch the line of sight. Within a group, bounds from a face's plane and edges skip more faces.
 
-A place on an edge or in a corner lies on several faces. It is given to the first of them, not to the one that rounding
-favours: their normals differ, and what a query finds must depend neither on its guess nor on other queries.
+A point on an edge or corner belongs to several faces, whose normals differ. It is assigned to the first of these faces, not
+to the one that rounding favours. So a result depends neither on its guess nor on other queries.
 """
 
 from __future__ import annotations
@@ -18,15 +18,15 @@ from diffcloud.compiled import kernel
 NO_GUESS: Ints = np.empty((0, 0), np.int64)
 _GROUP = 8
 _SAFE = 1 - 1e-12
-"""Part of a computed bound that rounding leaves."""
+"""Factor that makes a computed lower bound safe against rounding."""
 _EQUAL, _TOGETHER = 1e-9, 1e-24
-"""Part of a squared distance, and the squared distance [m²], by which equally near faces may differ."""
+"""Relative and absolute [m²] difference of squared distances up to which faces count as equally near."""
 
 
 @kernel
 def nearest_on_triangle(x: float, y: float, z: float, nodes: Floats, i: int, j: int, k: int, place: Floats) -> float:
-    """Squared distance of a point from the triangle of three nodes [V, 3] [m²]; writes the barycentric place [3]. (Ericson
-    2005, section 5.1.5.)"""
+    """Squared distance of a point from the triangle of nodes i, j, k [m²] (Ericson 2005, section 5.1.5). `nodes` is [V, 3].
+    `place` [3] receives the barycentric coordinates of the nearest point."""
     a0, a1, a2 = nodes[i, 0], nodes[i, 1], nodes[i, 2]
     b0, b1, b2 = nodes[j, 0], nodes[j, 1], nodes[j, 2]
     c0, c1, c2 = nodes[k, 0], nodes[k, 1], nodes[k, 2]
@@ -61,7 +61,7 @@ def nearest_on_triangle(x: float, y: float, z: float, nodes: Floats, i: int, j: 
 
 @kernel
 def grouped(nodes: Floats, faces: Ints) -> Ints:
-    """[G, 8] faces that lie close together, by nodes [V, 3] of the mesh; the last group is filled with its last face."""
+    """Groups [G, 8] of neighbouring faces, for node positions [V, 3]. The last group is padded with its last face."""
     centres = np.empty((len(faces), 3))
     for face in range(len(faces)):
         for axis in range(3):
@@ -69,7 +69,7 @@ def grouped(nodes: Floats, faces: Ints) -> Ints:
             centres[face, axis] = first + second + third
     order = curve_order(centres)
     found = np.zeros(((len(faces) + _GROUP - 1) // _GROUP, _GROUP), np.int64)
-    if len(order) < len(faces):  # nodes that are no numbers: any groups will do
+    if len(order) < len(faces):  # if node positions are not finite, any groups are correct
         order = np.arange(len(faces))
     for place in range(len(found) * _GROUP):
         found[place // _GROUP, place % _GROUP] = order[min(place, len(faces) - 1)]
@@ -78,7 +78,7 @@ def grouped(nodes: Floats, faces: Ints) -> Ints:
 
 @kernel
 def _spheres(nodes: Floats, faces: Ints, groups: Ints, spheres: Floats) -> None:
-    """spheres [G, 4]: centre and radius around all faces of each of the groups [G, n] [m]."""
+    """Compute the centre and radius of a sphere around all faces of each group [G, n], into `spheres` [G, 4] [m]."""
     for g in range(len(groups)):
         count = 3 * groups.shape[1]
         x = y = z = 0.0
@@ -95,8 +95,8 @@ def _spheres(nodes: Floats, faces: Ints, groups: Ints, spheres: Floats) -> None:
 
 @kernel
 def _sides(nodes: Floats, faces: Ints, groups: Ints, sides: Floats) -> None:
-    """sides [G, 16, 8]: of each face the unit normal, and those of its edges within its plane, outwards, each with its
-    offset. Where a face has no area, zero."""
+    """Compute four planes of each face into `sides` [G, 16, 8]: normal and offset of the face, then those of its edges.
+    Normals of edges are in the plane of the face and point outwards. All are zero for a face without area."""
     sides[:] = 0.0
     for g in range(len(groups)):
         for lane in range(_GROUP):
@@ -123,8 +123,11 @@ def _sides(nodes: Floats, faces: Ints, groups: Ints, sides: Floats) -> None:
 
 @kernel
 def _bounds(x: float, y: float, z: float, sides: Floats, begin: int, bounds: Floats) -> None:
-    """bounds [8]: the squared distances of a point from the faces of the group whose sides begin there are no smaller [m²]:
-    from their planes, and from the farthest of their edges' lines in them that it lies beyond."""
+    """Lower bounds of the squared distances of a point from the eight faces of a group, into `bounds` [8] [m²].
+
+    They combine the distance from the plane with the largest distance outside an edge. `begin` is the group's start in
+    `sides`.
+    """
     for lane in range(begin, begin + _GROUP):
         above = sides[lane] * x + sides[lane + 8] * y + sides[lane + 16] * z - sides[lane + 24]
         first = sides[lane + 32] * x + sides[lane + 40] * y + sides[lane + 48] * z - sides[lane + 56]
@@ -138,17 +141,17 @@ def _bounds(x: float, y: float, z: float, sides: Floats, begin: int, bounds: Flo
 
 @kernel
 def find_on_surface(queries: Floats, guesses: Ints, nodes: Floats, faces: Ints) -> tuple[Ints, Floats]:
-    """The nearest places on M states of a mesh.
+    """Find the nearest points on M states of a mesh.
 
     Args:
         queries: [M, Q, 3] [m].
-        guesses: [M, Q] faces that may be near; [0, 0]: none.
+        guesses: [M, Q] faces that may be near; [0, 0] for none.
         nodes: [M, V, 3] [m].
         faces: [F, 3], at least one.
 
     Returns:
-        ([M, Q] the nearest face of each, the first of equally near ones, [M, Q, 3] the barycentric place on it); the first
-        corner of the first face where a position is no number.
+        The nearest face of each query [M, Q], the first of equally near ones, and barycentric coordinates on it [M, Q, 3].
+        For positions that are not finite: the first corner of face 0.
     """
     states, count = queries.shape[0], queries.shape[1]
     found, places = np.zeros((states, count), np.int64), np.zeros((states, count, 3))
@@ -192,8 +195,8 @@ def find_on_surface(queries: Floats, guesses: Ints, nodes: Floats, faces: Ints) 
 
 @kernel
 def meets_triangle(start: Floats, way: Floats, nodes: Floats, i: int, j: int, k: int) -> float:
-    """How far along a unit way [3] a ray meets the triangle of three nodes [V, 3] [m]; negative where it does not. (Möller
-    and Trumbore 1997.)"""
+    """Distance along a unit direction `way` [3] at which a ray meets the triangle of nodes i, j, k [m]; negative if it does
+    not. `nodes` is [V, 3] (Möller and Trumbore 1997)."""
     a0, a1, a2 = nodes[i, 0], nodes[i, 1], nodes[i, 2]
     e1x, e1y, e1z = nodes[j, 0] - a0, nodes[j, 1] - a1, nodes[j, 2] - a2
     e2x, e2y, e2z = nodes[k, 0] - a0, nodes[k, 1] - a1, nodes[k, 2] - a2
@@ -214,9 +217,16 @@ def meets_triangle(start: Floats, way: Floats, nodes: Floats, i: int, j: int, k:
 
 @kernel
 def find_hidden(points: Floats, eyes: Floats, blind: Ints, nodes: Floats, faces: Ints, near: float) -> Ints:
-    """[M, N, 3] points beside M states of a mesh, [M, C, 3] eyes, [M, N, C] 1 where an eye is blind, [M, V, 3] nodes,
-    [F, 3] faces -> [M, N] 1 where a face stands before a point for every eye that is not. What is nearer to a point than
-    `near` [m] does not hide it: its own face, a layer that it lies on."""
+    """Find the points that M states of a mesh hide from all viewpoints: [M, N] 1 if hidden, else 0.
+
+    Args:
+        points: [M, N, 3] [m].
+        eyes: [M, C, 3] viewpoints [m].
+        blind: [M, N, C] 1 if a viewpoint cannot see a point anyway.
+        nodes: [M, V, 3] [m].
+        faces: [F, 3].
+        near: faces closer than this to a point do not hide it, such as its own face or an adjacent layer [m].
+    """
     states, count = points.shape[0], points.shape[1]
     found = np.ones((states, count), np.int64)
     groups = grouped(nodes[0], faces)
@@ -256,7 +266,8 @@ def _is_hidden(
     around: Floats,
     spheres: Floats,
 ) -> bool:
-    """Whether a face stands in the unit way [3] from a point to an eye at a distance."""
+    """Whether a face blocks the line of sight from a point along the unit direction `way` [3], between `near` and `length`
+    [m]."""
     for g in range(len(around)):
         if _is_beside(point, way, length, near, around, g):
             continue
@@ -271,7 +282,7 @@ def _is_hidden(
 
 @kernel
 def _is_beside(point: Floats, way: Floats, length: float, near: float, spheres: Floats, index: int) -> bool:
-    """Whether nothing of a sphere is in the way from a point on, between `near` and `length` [m]."""
+    """Whether a sphere is outside the line of sight from a point, between `near` and `length` [m]."""
     x, y, z = spheres[index, 0] - point[0], spheres[index, 1] - point[1], spheres[index, 2] - point[2]
     along, reach = x * way[0] + y * way[1] + z * way[2], spheres[index, 3]
     if along < near - reach or along > length + reach:
@@ -280,7 +291,7 @@ def _is_beside(point: Floats, way: Floats, length: float, near: float, spheres: 
 
 
 def compile_surface() -> None:
-    """Compile what queries need."""
+    """Compile the kernels for queries."""
     points, nodes, faces = np.zeros((1, 1, 3)), np.zeros((1, 3, 3)), np.array([[0, 1, 2]])
     find_on_surface(points, NO_GUESS, nodes, faces)
     find_hidden(points, points + 1.0, np.zeros((1, 1, 1), np.int64), nodes, faces, 0.01)

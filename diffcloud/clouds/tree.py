@@ -1,12 +1,13 @@
-"""Nearest points by a tree of boxes, in kernels.
+"""Exact nearest points by a tree of boxes, in kernels.
 
-Points lie along a Hilbert curve, eight to a leaf; sixteen consecutive nodes make a node of the level above. Sixteen
-queries that follow each other on their own curve go through the tree together: a node is opened where its box comes as
-near to the box of the queries as the farthest of the neighbours found so far. Guesses, and the leaf in which the last
-queries found theirs, are looked at first. Rounding is monotone, so the computed distance to a box never exceeds that to a
-point in it: the result is exact, and of equally near points the one of lowest number.
+Points are sorted along a Hilbert curve, eight per leaf. Sixteen consecutive nodes form a node of the next level. Sixteen
+consecutive queries along their own curve traverse the tree together. A node is opened if its box is as close to the box of
+the queries as the farthest neighbour found so far. Guesses, and the leaf of the previous neighbours, are tested first.
 
-Loops over sixteen become vector instructions: their length is a constant, too long to be unrolled, and without branches.
+Rounding is monotone, so the computed distance to a box never exceeds that to a point inside. So the result is exact. Of
+equally near points it is the one with the lowest index.
+
+Loops over sixteen have a constant length, no branches, and are too long to be unrolled. So they become vector instructions.
 """
 
 from __future__ import annotations
@@ -22,30 +23,31 @@ _LEAF = 8
 _FAN = 16
 _LANES = 16
 _X, _Y, _Z, _NEAREST, _FOUND = 0, _LANES, 2 * _LANES, 3 * _LANES, 4 * _LANES
-"""Where the queries' coordinates, their squared distances, and the numbers of their neighbours begin."""
+"""Offsets of the queries' coordinates, squared distances and neighbour indices."""
 _STACK = 16 * _FAN
 
 
 class Tree(NamedTuple):
-    """A cloud of P points."""
+    """Search tree of a cloud of P points."""
 
     points: Floats
-    """[P, 3] [m]"""
+    """[P, 3] points [m]."""
     order: Ints
-    """[P] their numbers along the curve."""
+    """[P] indices of the points along the curve."""
     leaves: Floats
-    """[L * 32] for each leaf 8 x, 8 y, 8 z [m], 8 numbers; infinite, with number P, where the last has fewer points."""
+    """[L * 32] for each leaf 8 x, 8 y, 8 z [m] and 8 indices. Missing points in the last leaf are infinite, with index
+    P."""
     boxes: Floats
-    """[G * 96] for each group of 16 nodes 16 lowest x, y, z, then 16 highest; the boxes of missing ones are inside out."""
+    """[G * 96] for each group of 16 nodes 16 lowest x, y, z, then 16 highest [m]. Boxes of missing nodes are inverted."""
     starts: Ints
-    """[D] the first group of each level, leaves first; group n of a level holds the children of node n of the next."""
+    """[D] first group of each level, leaves first. Group n of a level contains the children of node n of the next level."""
     counts: Ints
-    """[D] nodes of each level."""
+    """[D] number of nodes of each level."""
 
 
 @kernel
 def build_tree(points: Floats) -> Tree:
-    """[P, 3] finite points, at least one -> their tree."""
+    """Build the tree of finite points [P, 3], at least one."""
     order = curve_order(points)
     size = len(order)
     starts, counts = np.zeros(16, np.int64), np.zeros(16, np.int64)
@@ -103,7 +105,7 @@ def _scan(leaves: Floats, leaf: int, lanes: Floats) -> None:
 
 @kernel
 def _reach(lanes: Floats) -> float:
-    """The largest squared distance found so far, in pairs so that they do not wait for each other."""
+    """Largest squared distance found so far. Pairwise, so that the comparisons can run in parallel."""
     reach = -np.inf
     for k in range(_NEAREST, _NEAREST + _LANES, 4):
         reach = larger(reach, larger(larger(lanes[k], lanes[k + 1]), larger(lanes[k + 2], lanes[k + 3])))
@@ -112,7 +114,7 @@ def _reach(lanes: Floats) -> float:
 
 @kernel
 def _gaps(boxes: Floats, group: int, box: Floats, gaps: Floats) -> None:
-    """[16] squared distances from the queries' box (lowest x, y, z, highest) to those of a group."""
+    """Squared distances [16] from the queries' box (lowest x, y, z, highest x, y, z) to the boxes of a group."""
     begin = 6 * _FAN * group
     low_x, low_y, low_z, high_x, high_y, high_z = box[0], box[1], box[2], box[3], box[4], box[5]
     for k in range(_FAN):
@@ -125,7 +127,7 @@ def _gaps(boxes: Floats, group: int, box: Floats, gaps: Floats) -> None:
 
 @kernel
 def _gather(queries: Floats, order: Ints, guesses: Ints, begin: int, points: Floats, lanes: Floats, box: Floats) -> None:
-    """Load the next queries with their guesses, the last of all as often as lanes are left, and their box."""
+    """Load the next queries with their guesses and their bounding box. The last query fills the remaining lanes."""
     for axis in range(3):
         low, high = np.inf, -np.inf
         for lane in range(_LANES):
@@ -144,15 +146,16 @@ def _gather(queries: Floats, order: Ints, guesses: Ints, begin: int, points: Flo
 
 @kernel
 def find_nearest(queries: Floats, order: Ints, guesses: Ints, tree: Tree) -> Ints:
-    """[Q, 3] queries, the numbers of those to answer along a curve -> [Q] number of the nearest point; 0 for the others.
+    """Index [Q] of the nearest point of each query [Q, 3] that `order` lists; 0 for the other queries.
 
     Args:
-        guesses: [Q] points that may be near; below zero, or [0]: none.
+        order: indices of the queries to answer, along a curve.
+        guesses: [Q] points that may be near; negative for none, or [0] without guesses.
     """
     result = np.zeros(len(queries), np.int64)
     lanes, box, gaps = np.empty(5 * _LANES), np.empty(6), np.empty(_FAN)
     nodes, levels, bounds = np.empty(_STACK, np.int64), np.empty(_STACK, np.int64), np.empty(_STACK)
-    leaf = 0  # in which the last queries found theirs
+    leaf = 0  # leaf in which the previous neighbours were found
     for begin in range(0, len(order), _LANES):
         _gather(queries, order, guesses, begin, tree.points, lanes, box)
         _scan(tree.leaves, leaf, lanes)

@@ -1,4 +1,4 @@
-"""Which places on a mesh viewpoints see."""
+"""Visibility of points on a mesh from viewpoints."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from torch import Tensor
 def seen_places(
     positions: Tensor, faces: Tensor, points: Tensor, viewpoints: Tensor, *, near: float, blind: Tensor | None = None
 ) -> Tensor:
-    """bool [B, L, N] which points [B, L, N, 3] no face [F, 3] hides from all viewpoints [B, C, 3].
+    """Whether points [B, L, N, 3] are visible from at least one viewpoint [B, C, 3], bool [B, L, N]. Faces [F, 3] occlude.
 
     Args:
         positions: [B, L, V, 3] nodes of the meshes.
-        near: what is nearer to a point hides nothing.
-        blind: bool [B, L, N, C] which viewpoints cannot see a point anyway; None for none.
+        near: faces closer than this to a point do not occlude it.
+        blind: bool [B, L, N, C] True if a viewpoint cannot see a point anyway; None for none.
     """
     from diffcloud.clouds.surface import find_hidden  # numba takes a moment to import
 

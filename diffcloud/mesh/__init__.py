@@ -1,4 +1,4 @@
-"""Triangle meshes: topology, material-space geometry, and procedural shapes (numpy and scipy only)."""
+"""Triangle meshes: topology, geometry in material space, and procedural shapes (numpy and scipy only)."""
 
 from diffcloud.mesh.shapes import (
     box_surface,

@@ -1,4 +1,4 @@
-"""Procedural cloths and obstacles."""
+"""Procedural meshes of cloths and obstacles."""
 
 from __future__ import annotations
 
@@ -12,22 +12,22 @@ from diffcloud.errors import MeshError
 from diffcloud.mesh.topology import ClothMesh, FloatArray, IntArray, SurfaceMesh
 
 _ARC_SAMPLES = 2001
-"""Of the quarter ellipse whose arc length is integrated: enough for 1e-6 of its length."""
+"""Samples for the arc length of a quarter ellipse; its relative error is then below 1e-6."""
 
 
 def grid_cloth(rows: int, columns: int, height: float, width: float, *, through: int = 0) -> ClothMesh:
-    """A flat rectangular cloth in the plane z = 0, centred on the origin, rest shape equal to its world shape.
+    """A flat rectangular cloth in the plane z = 0, centred at the origin. Its rest shape equals its initial shape.
 
-    Node (i, j) has index i·columns + j; i runs along +y (and material v), j along +x (and material u). Diagonals
-    alternate, which makes bending less dependent on direction than if all ran one way.
+    Node (i, j) has index i·columns + j. i increases along +y (and material v), j along +x (and material u). Diagonals
+    alternate, so bending depends less on direction than with parallel diagonals.
 
     Args:
         rows, columns: node counts, at least 2 each.
         height, width: extent along y and x [m], positive.
-        through: index of a node where diagonals meet, as they do at every second node.
+        through: index of a node where diagonals meet. They meet at every second node.
 
     Raises:
-        MeshError: fewer than 2 nodes a side, or a size that is not positive.
+        MeshError: fewer than 2 nodes per side, or a size that is not positive.
     """
     if rows < 2 or columns < 2:
         raise MeshError(f"A grid cloth needs at least 2 x 2 nodes, got {rows} x {columns}.")
@@ -37,11 +37,11 @@ def grid_cloth(rows: int, columns: int, height: float, width: float, *, through:
 
 
 def lined_cloth(across: FloatArray, along: FloatArray, *, through: int = 0) -> ClothMesh:
-    """`grid_cloth` with grid lines at given places.
+    """A cloth like `grid_cloth`, with grid lines at given positions.
 
     Args:
-        across: [columns] places of the lines along x, ascending from 0 to the width [m].
-        along: [rows] those along y.
+        across: [columns] positions of the lines along x, ascending from 0 to the width [m].
+        along: [rows] positions of the lines along y, ascending from 0 to the height [m].
         through: index of a node where diagonals meet.
     """
     v, u = np.meshgrid(along, across, indexing="ij")
@@ -52,19 +52,19 @@ def lined_cloth(across: FloatArray, along: FloatArray, *, through: int = 0) -> C
 
 
 def loop_cloth(rows: int, columns: int, width: float, circumference: float, end_radius: float | None = None) -> ClothMesh:
-    """A closed band standing upright around the z axis, centred on the origin.
+    """A closed band that stands upright around the z axis, centred at the origin.
 
-    Material space is the unrolled strip: u runs along the band (counter-clockwise seen from above), v upwards. Node
-    (i, j) has index i·columns + j, i runs upwards, j along the band from its place at -y. Where the strip is closed, at
-    j = 0, a node owns two verts. Faces are counter-clockwise seen from outside.
+    Material space is the unrolled strip: u runs along the band (counter-clockwise from above), v upwards. Node (i, j) has
+    index i·columns + j. i increases upwards, j along the band from its point at -y. At the closing seam (j = 0), each node
+    has two verts. Faces are counter-clockwise seen from outside.
 
     Args:
-        rows: nodes across the band, at least 2.
-        columns: nodes along it, at least 3.
+        rows: number of nodes across the band, at least 2.
+        columns: number of nodes along the band, at least 3.
         width: across the band [m].
         circumference: along the band [m].
-        end_radius: of the two half circles at -y and +y; straight lines join them. None: one circle. Where the band is
-            curved, the world shape's chords are a little shorter than the rest shape [m].
+        end_radius: radius of the two half circles at -y and +y, which straight lines join [m]. None: one circle. In curved
+            parts the initial edges are chords, slightly shorter than at rest.
 
     Raises:
         MeshError: too few nodes, a size that is not positive, or a radius too large for the circumference.
@@ -90,19 +90,19 @@ def loop_cloth(rows: int, columns: int, width: float, circumference: float, end_
 
 
 def _stadium(along: FloatArray, circumference: float, radius: float) -> FloatArray:
-    """[N] distances along a stadium, counter-clockwise from its lowest point -> [N, 2] places."""
+    """Points [N, 2] at distances [N] along a stadium, counter-clockwise from its lowest point."""
     straight = (circumference - 2 * np.pi * radius) / 2
     quarter = np.pi * radius / 2
     past = along[:, None] - np.cumsum([0, quarter, straight, 2 * quarter, straight])
-    turn = np.clip(past, 0, [quarter, straight, 2 * quarter, straight, quarter])  # how much of each part lies behind
+    turn = np.clip(past, 0, [quarter, straight, 2 * quarter, straight, quarter])  # covered length of each of the five parts
     angle = -np.pi / 2 + (turn[:, 0] + turn[:, 2] + turn[:, 4]) / radius
     centre = -straight / 2 + turn[:, 1] - turn[:, 3]
-    # counter-clockwise the right side runs up and the left side down
+    # Counter-clockwise, the right side runs up and the left side down.
     return np.stack([radius * np.cos(angle), centre + radius * np.sin(angle)], axis=1)
 
 
 _VEST_UP = np.array([0.0, 0.2, 0.4, 0.58, 0.72, 0.86, 1.0])
-"""Rows of a vest's panel, as a part of its height: hem, side seam up to the armpit (0.58), chest, strap, shoulder."""
+"""Rows of a vest's panel, relative to its height: hem, side seam up to the armpit (0.58), chest, strap, shoulder."""
 _VEST_ACROSS = np.array(
     [
         *[[-1.0, -2 / 3, -1 / 3, 0.0, 1 / 3, 2 / 3, 1.0]] * 4,
@@ -111,33 +111,34 @@ _VEST_ACROSS = np.array(
         [-0.76, -0.58, -0.4, 0.0, 0.4, 0.58, 0.76],
     ]
 )
-"""[row, column] as a part of half the width. Above the armpits the outer columns are the arm holes' edge."""
+"""[row, column] positions relative to half the width. Above the armpits, the outer columns are the edge of the armholes."""
 _NECK_COLUMN, _CHEST_ROW = 3, 4
-"""The middle column ends at the chest: above it is the neck."""
+"""The middle column ends at the chest, because the neck opening is above it."""
 _NECK_BOTTOM = {"front": 0.65, "back": 0.7}
-"""Lowest point of the neck opening, as a part of the height."""
+"""Lowest point of the neck opening, relative to the height."""
 _LEAN = np.array([1.0, 1.0, 1.0, 1.0, 1.0, 0.55, 0.0])
-"""Distance of each row from the plane between the panels, as a part of the ellipse's: the straps meet at the shoulder."""
+"""Distance of each row from the middle plane, relative to that of the ellipse. The straps meet at the shoulder."""
 _ARMPIT_ROW, _SHOULDER_ROW = 3, 6
 
 
 def vest_cloth(width: float, height: float, depth: float) -> ClothMesh:
-    """A sleeveless vest of 80 nodes: two panels joined by seams at the sides and the shoulders.
+    """A sleeveless vest of 80 nodes: two panels, joined by seams at the sides and the shoulders.
 
-    It stands upright and open: x runs along the shoulders, the front looks to -y, the hem lies in the plane z = 0. Each
-    panel is a patch of its own in material space (seen from outside, the back to the right of the front), and the nodes
-    of the seams own a vert in both. Openings: waist, neck and two arms. The cross-section is an ellipse whose half
-    circumference is the panel's width, so the body is nearly at rest; the straps lean together and are strained a little.
+    It stands upright and open. x is parallel to the shoulders, the front faces -y, and the hem is in the plane z = 0. Each
+    panel is a separate patch in material space, seen from outside, the back to the right of the front. Nodes on seams have
+    a vert in both. Openings: waist, neck and two arms. The cross-section is an ellipse whose half circumference is the
+    panel's width. So the body is almost unstrained. The straps lean together and are slightly strained.
 
-    Nodes are those of the front panel from the hem upwards, each row along +x, then those of the back that are on no seam.
+    Nodes are those of the front panel from the hem upwards, each row along +x. Then follow those of the back, without the
+    seams.
 
     Args:
-        width: of a panel, flat [m].
-        height: of a panel from the hem to the shoulder, flat [m].
-        depth: half the distance between front and back: the ellipse's semi-axis along y [m].
+        width: of a flat panel [m].
+        height: of a flat panel, from the hem to the shoulder [m].
+        depth: half the distance between front and back, the ellipse's semi-axis along y [m].
 
     Raises:
-        MeshError: sizes that are not positive, or a depth beyond a round cross-section.
+        MeshError: a size is not positive, or the depth exceeds that of a circular cross-section.
     """
     if not (width > 0 and height > 0 and depth > 0):
         raise MeshError(f"A vest needs a positive width, height and depth in metres, got {width}, {height}, {depth}.")
@@ -148,18 +149,18 @@ def vest_cloth(width: float, height: float, depth: float) -> ClothMesh:
     x, y = _on_half_ellipse(u, depth, width)
     lean = _LEAN[:, None]
     rise = np.diff(_VEST_UP)[:, None] * height
-    # what a strap leans it loses in height, so that it keeps its length
+    # A leaning strap is lower, so that its length is preserved.
     rise = np.sqrt(np.maximum(rise**2 - (y[1:] * np.diff(lean, axis=0)) ** 2, (0.5 * rise) ** 2))
     z = np.concatenate([np.zeros((1, u.shape[1])), np.cumsum(rise, axis=0)])
 
     def panel(which: str) -> tuple[FloatArray, FloatArray]:
-        """(material space, world) of one panel's nodes; the side of the world is set by the sign of y."""
+        """Nodes of one panel in material space and in world space. The sign of y sets the side."""
         v = np.repeat(_VEST_UP[:, None] * height, u.shape[1], axis=1)
         drop = v[_CHEST_ROW, _NECK_COLUMN] - _NECK_BOTTOM[which] * height
         side, height_up = (-1.0 if which == "front" else 1.0), z.copy()
         v[_CHEST_ROW, _NECK_COLUMN] -= drop
         height_up[_CHEST_ROW, _NECK_COLUMN] -= drop
-        material = np.stack([-side * u, v], axis=-1)  # the back's u runs along -x: its outside is seen from behind
+        material = np.stack([-side * u, v], axis=-1)  # u of the back runs along -x, since it is seen from behind
         return material[present], np.stack([x, side * y * lean, height_up], axis=-1)[present]
 
     front_verts, front_nodes = panel("front")
@@ -177,35 +178,31 @@ def vest_cloth(width: float, height: float, depth: float) -> ClothMesh:
 
 
 def vest_shoulder(side: int) -> list[int]:
-    """Nodes of `vest_cloth` on one shoulder seam, from the neck to the arm.
-
-    Args:
-        side: 1 for the shoulder at +x, -1 for that at -x.
-    """
+    """Nodes of `vest_cloth` on one shoulder seam, from the neck to the arm: at +x for `side` 1, at -x for -1."""
     index = np.cumsum(_vest_present()).reshape(_VEST_ACROSS.shape) - 1
     columns = [4, 5, 6] if side > 0 else [2, 1, 0]
     return [int(node) for node in index[_SHOULDER_ROW, columns]]
 
 
 def rectangle_surface(center: Sequence[float], half_size: Sequence[float], height: float) -> SurfaceMesh:
-    """A horizontal rectangle that looks upwards: a table.
+    """A horizontal rectangle that faces upwards, such as a table.
 
     Args:
-        center, half_size: (x, y) of its middle, and half its extent [m].
-        height: its z [m].
+        center, half_size: (x, y) of its centre, and half its extent [m].
+        height: z of the rectangle [m].
     """
     corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * np.asarray(half_size) + np.asarray(center)
     return SurfaceMesh(np.column_stack([corners, np.full(4, height)]), np.array([[0, 1, 2], [0, 2, 3]]))
 
 
 def box_surface(lower: Sequence[float], upper: Sequence[float]) -> SurfaceMesh:
-    """A closed axis-aligned box of 8 nodes and 12 faces, outside out.
+    """A closed axis-aligned box of 8 nodes and 12 faces, with outward normals.
 
     Args:
-        lower, upper: its corners (x, y, z) [m].
+        lower, upper: corners (x, y, z) [m].
 
     Raises:
-        MeshError: corners out of order.
+        MeshError: the lower corner is not below the upper one.
     """
     low, high = np.asarray(lower, dtype=np.float64), np.asarray(upper, dtype=np.float64)
     if not (low < high).all():
@@ -217,15 +214,15 @@ def box_surface(lower: Sequence[float], upper: Sequence[float]) -> SurfaceMesh:
 
 
 def cylinder_surface(start: Sequence[float], end: Sequence[float], radius: float, sides: int = 24) -> SurfaceMesh:
-    """A closed prism with a regular polygon as cross-section, capped, outside out.
+    """A closed prism with a regular polygon as cross-section, with outward normals.
 
     Args:
-        start, end: middle of its two caps [m].
-        radius: of the circle through its corners [m].
-        sides: of the polygon, at least 3.
+        start, end: centres of its two caps [m].
+        radius: of the circle through the polygon's corners [m].
+        sides: number of sides, at least 3.
 
     Raises:
-        MeshError: fewer than 3 sides, or no length or radius.
+        MeshError: fewer than 3 sides, or a length or radius that is not positive.
     """
     first, last = np.asarray(start, dtype=np.float64), np.asarray(end, dtype=np.float64)
     length = float(np.linalg.norm(last - first))
@@ -251,15 +248,15 @@ def cylinder_surface(start: Sequence[float], end: Sequence[float], radius: float
 
 
 def sphere_surface(center: Sequence[float], radius: float, subdivisions: int = 2) -> SurfaceMesh:
-    """A closed icosphere of 20 · 4^subdivisions faces, outside out.
+    """A closed icosphere of 20 · 4^subdivisions faces, with outward normals.
 
     Args:
         center: (x, y, z) [m].
         radius: of the sphere through its nodes [m].
-        subdivisions: how often each triangle is divided into four.
+        subdivisions: how often each triangle is split into four.
 
     Raises:
-        MeshError: no radius, or a negative number of subdivisions.
+        MeshError: a radius that is not positive, or a negative number of subdivisions.
     """
     if not radius > 0 or subdivisions < 0:
         raise MeshError(f"A sphere needs a radius and 0 or more subdivisions, got {radius} m and {subdivisions}.")
@@ -280,8 +277,8 @@ def sphere_surface(center: Sequence[float], radius: float, subdivisions: int = 2
 
 
 def _grid_faces(rows: int, columns: int, through: int) -> IntArray:
-    """[2 (rows - 1)(columns - 1), 3] faces of a grid whose point (i, j) has index i·columns + j; diagonals meet at
-    the point `through` and at those an even number of cells away."""
+    """Faces [2 (rows - 1)(columns - 1), 3] of a grid whose point (i, j) has index i·columns + j. Diagonals meet at the
+    point `through`, and at all points an even number of cells away."""
     i, j = (index.ravel() for index in np.meshgrid(np.arange(rows - 1), np.arange(columns - 1), indexing="ij"))
     a = i * columns + j
     turned = (i + j) % 2 == sum(divmod(through, columns)) % 2
@@ -289,8 +286,8 @@ def _grid_faces(rows: int, columns: int, through: int) -> IntArray:
 
 
 def _quad_faces(corners: IntArray, turned: NDArray[np.bool_]) -> IntArray:
-    """[2 Q, 3] triangles of quads [Q, 4] (left bottom, right bottom, left top, right top), with the diagonal from the
-    right bottom, or where turned from the left bottom."""
+    """Triangles [2 Q, 3] of quads [Q, 4], given as (left bottom, right bottom, left top, right top). The diagonal starts at
+    the right bottom, or if `turned` at the left bottom."""
     a, b, c, d = corners.T
     first = np.where(turned[:, None], np.stack([a, b, d], axis=1), np.stack([a, b, c], axis=1))
     second = np.where(turned[:, None], np.stack([a, d, c], axis=1), np.stack([b, d, c], axis=1))
@@ -298,14 +295,14 @@ def _quad_faces(corners: IntArray, turned: NDArray[np.bool_]) -> IntArray:
 
 
 def _vest_present() -> NDArray[np.bool_]:
-    """[row, column] which points of the panel's grid are cloth."""
+    """[row, column] True for points of the panel's grid that are cloth."""
     present = np.ones(_VEST_ACROSS.shape, dtype=bool)
     present[_CHEST_ROW + 1 :, _NECK_COLUMN] = False
     return present
 
 
 def _vest_seam() -> NDArray[np.bool_]:
-    """[row, column] which points of the panel's grid both panels share."""
+    """[row, column] True for points of the panel's grid that both panels share."""
     seam = np.zeros(_VEST_ACROSS.shape, dtype=bool)
     seam[: _ARMPIT_ROW + 1, [0, -1]] = True
     seam[_SHOULDER_ROW] = True
@@ -313,7 +310,7 @@ def _vest_seam() -> NDArray[np.bool_]:
 
 
 def _vest_faces() -> IntArray:
-    """Faces of a panel over its present points, with diagonals that mirror each other at the middle."""
+    """Faces of a panel over its existing points, with diagonals that are mirror-symmetric about the middle."""
     present = _vest_present()
     index = np.cumsum(present).reshape(present.shape) - 1
     whole = present[:-1, :-1] & present[:-1, 1:] & present[1:, :-1] & present[1:, 1:]
@@ -323,15 +320,12 @@ def _vest_faces() -> IntArray:
 
 
 def _on_half_ellipse(arc: FloatArray, depth: float, length: float) -> tuple[FloatArray, FloatArray]:
-    """(x, y >= 0) of points on the half ellipse of semi-axis `depth` along y and arc length `length`.
-
-    Args:
-        arc: signed arc length from the top of the ellipse, in ±length/2 [m].
-    """
+    """Points (x, y >= 0) on a half ellipse with semi-axis `depth` along y and arc length `length`. `arc` is the signed arc
+    length from the top of the ellipse, in ±length/2 [m]."""
     angle = np.linspace(0, np.pi / 2, _ARC_SAMPLES)
 
     def quarter(semi_axis: float) -> FloatArray:
-        """[samples] arc length from the top at each angle."""
+        """Arc length from the top at each sampled angle."""
         speed = np.hypot(semi_axis * np.cos(angle), depth * np.sin(angle))
         return np.concatenate([[0.0], np.cumsum((speed[1:] + speed[:-1]) / 2 * np.diff(angle))])
 
@@ -343,7 +337,7 @@ def _on_half_ellipse(arc: FloatArray, depth: float, length: float) -> tuple[Floa
 
 
 def _divided(nodes: FloatArray, faces: IntArray) -> tuple[FloatArray, IntArray]:
-    """Each triangle of a unit sphere into four, with the new nodes on the sphere."""
+    """Split each triangle of a unit sphere into four, with the new nodes on the sphere."""
     half = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
     edges, inverse = np.unique(half, axis=0, return_inverse=True)
     middle = nodes[edges].mean(axis=1)

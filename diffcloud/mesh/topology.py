@@ -1,7 +1,7 @@
 """Meshes and their connectivity.
 
-A *node* is a world-space point, a *vert* a material-space point; a node on a seam owns several verts
-(ARCSim's distinction, Narain et al. 2012). Faces index verts, and verts point to nodes.
+A *node* is a point in world space, a *vert* a point in material space. A node on a seam has several verts (as in ARCSim,
+Narain et al. 2012). Faces are triples of verts, and each vert belongs to a node.
 """
 
 from __future__ import annotations
@@ -20,26 +20,26 @@ IntArray = NDArray[np.int64]
 
 _MISSING = -1
 _SMALLEST_AREA = 1e-14
-"""Relative to the squared extent of the material space: below it a face has no shape."""
+"""Smallest area of a face, relative to the squared extent of the material space."""
 
 
 @dataclass(frozen=True)
 class Hinges:
-    """Edges between two faces, as the bending energy needs them. H hinges, two sides each."""
+    """The H edges between two faces, for the bending energy."""
 
     nodes: IntArray
-    """[H, 4]: the edge (n0, n1), then the opposite node in the face of slot 0 and of slot 1."""
+    """[H, 4]: the edge (n0, n1), then the opposite node of face 0 and of face 1."""
     faces: IntArray
-    """[H, 2]: slot 0 traverses the edge n0 -> n1, slot 1 traverses it n1 -> n0."""
+    """[H, 2]: face 0 traverses the edge n0 -> n1, face 1 traverses it n1 -> n0."""
     length: FloatArray
-    """[H] material-space length, mean of both sides [m]."""
+    """[H] length in material space, mean of both sides [m]."""
     angle: FloatArray
     """[H, 2] direction of the edge in material space on each side [rad]."""
 
 
 @dataclass(frozen=True)
 class SurfaceMesh:
-    """A plain triangle mesh in world space: obstacles, and anything that is only looked at."""
+    """A triangle mesh in world space, for obstacles and rendering."""
 
     nodes: FloatArray
     """[V, 3] positions [m]."""
@@ -48,7 +48,7 @@ class SurfaceMesh:
 
     @staticmethod
     def joined(parts: Sequence[SurfaceMesh]) -> SurfaceMesh:
-        """Several as one; of none, no nodes and no faces."""
+        """Concatenate meshes. An empty list gives an empty mesh."""
         first = np.cumsum([0, *(len(part.nodes) for part in parts)])
         return SurfaceMesh(
             np.concatenate([np.zeros((0, 3)), *(part.nodes for part in parts)]),
@@ -58,7 +58,7 @@ class SurfaceMesh:
         )
 
     def plane(self) -> tuple[FloatArray, float] | None:
-        """(unit normal [3], offset) if all nodes lie in one plane normal . x = offset, else None."""
+        """(unit normal [3], offset [m]) if all nodes are in one plane normal · x = offset, else None."""
         corner = self.nodes[self.faces]
         normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]).sum(axis=0)
         length = np.linalg.norm(normal)
@@ -72,11 +72,11 @@ class SurfaceMesh:
 
 @dataclass(frozen=True)
 class ClothMesh:
-    """A cloth: world-space nodes, material-space verts, and the faces between them.
+    """A cloth: nodes in world space, verts in material space, and faces.
 
     Raises:
-        MeshError: an index out of range, a face without area or with a repeated node, a face whose material
-            space is turned over, or an edge with more than two faces.
+        MeshError: an index is out of range, a face has no area, a repeated node or the wrong orientation in material space,
+            or an edge has more than two faces.
     """
 
     nodes: FloatArray
@@ -110,40 +110,40 @@ class ClothMesh:
 
     @cached_property
     def material_edges(self) -> FloatArray:
-        """[F, 2, 2] Dm: columns are the two material-space edges that leave corner 0 [m]."""
+        """[F, 2, 2] edge matrix: its columns are the two edges from corner 0, in material space [m]."""
         u = self.verts[self.face_verts]
         return np.stack([u[:, 1] - u[:, 0], u[:, 2] - u[:, 0]], axis=-1)
 
     @cached_property
     def face_area(self) -> FloatArray:
-        """[F] material-space area [m²]."""
+        """[F] area in material space [m²]."""
         return 0.5 * np.linalg.det(self.material_edges)
 
     @cached_property
     def smallest_height(self) -> float:
-        """Of all triangles, in material space [m]."""
+        """Smallest height of all triangles in material space [m]."""
         corner = self.verts[self.face_verts]
         longest = np.linalg.norm(corner - np.roll(corner, 1, axis=1), axis=-1).max(axis=1)
         return float((2 * self.face_area / longest).min())
 
     @cached_property
     def node_area(self) -> FloatArray:
-        """[V] a third of the material-space area of the faces around each node [m²]."""
+        """[V] a third of the area of the adjacent faces, in material space [m²]."""
         return np.bincount(self.faces.ravel(), np.repeat(self.face_area / 3, 3), len(self.nodes)).astype(np.float64)
 
     @cached_property
     def edges(self) -> tuple[IntArray, IntArray]:
-        """(edges [E, 2], faces [E, 2]): edges in face order, and the face in each slot, -1 where none.
+        """Edges [E, 2] in face order, and the faces [E, 2] at each edge, -1 if there is none.
 
-        An edge runs as the first face that uses it does. Slot 0 holds the face that traverses it forwards, slot 1
-        the one that traverses it backwards. Where two faces traverse it the same way the later one takes the slot
-        and the edge counts as boundary, as in ARCSim (the published band mesh has two such edges).
+        An edge has the direction of the first face that uses it. Column 0 has the face that traverses it forwards, column 1
+        the one that traverses it backwards. If two faces traverse it in the same direction, the later one replaces the
+        other, and the edge counts as boundary, as in ARCSim. The published band mesh has two such edges.
         """
         return directed_edges(self.faces)
 
     @cached_property
     def hinges(self) -> Hinges:
-        """Every edge that has a face on both sides."""
+        """All edges with a face on both sides."""
         edges, faces = self.edges
         inner = (faces != _MISSING).all(axis=1)
         edge, pair = edges[inner], faces[inner]
@@ -158,11 +158,8 @@ class ClothMesh:
 
     @cached_property
     def size(self) -> float:
-        """How far apart nodes can be on the cloth: the longest of the shortest ways along edges, in material space [m].
-
-        Found by going to the farthest node of the first one, and from there to its farthest: on a cloth without long arms
-        that is the longest way.
-        """
+        """Largest distance between two nodes along edges, in material space [m]. Computed from the farthest node of node 0,
+        and the farthest node of that one. This is exact for cloths without long arms."""
         from scipy.sparse import coo_array
         from scipy.sparse.csgraph import dijkstra  # slow to import
 
@@ -175,7 +172,7 @@ class ClothMesh:
         return float(ways[np.isfinite(ways)].max())
 
     def _material_edge(self, face: IntArray, edge: IntArray) -> FloatArray:
-        """[H, 2] u(n1) - u(n0) in the material space of the given face of each edge."""
+        """Edge vectors u(n1) - u(n0) [H, 2] in the material space of the given face of each edge."""
         corners, verts = self.faces[face], self.face_verts[face]
         start = verts[np.arange(len(face)), np.argmax(corners == edge[:, :1], axis=1)]
         end = verts[np.arange(len(face)), np.argmax(corners == edge[:, 1:], axis=1)]
@@ -211,7 +208,7 @@ class ClothMesh:
 
 
 def directed_edges(faces: IntArray) -> tuple[IntArray, IntArray]:
-    """(edges [E, 2], faces [E, 2]) of triangles [F, 3]; the conventions are those of `ClothMesh.edges`."""
+    """Edges [E, 2] and their faces [E, 2] for triangles [F, 3], with the conventions of `ClothMesh.edges`."""
     half = faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
     key = np.sort(half, axis=1)
     _, first, inverse = np.unique(key, axis=0, return_index=True, return_inverse=True)
@@ -227,5 +224,5 @@ def directed_edges(faces: IntArray) -> tuple[IntArray, IntArray]:
 
 
 def _opposite_node(corners: IntArray, edge: IntArray) -> IntArray:
-    """[H] the corner of each face that is not on the edge."""
+    """[H] the corner of each face that is not on its edge."""
     return corners.sum(axis=1) - edge.sum(axis=1)

@@ -31,7 +31,7 @@ _MODULES = ("materials", "properties", "simulate", "system")
 
 
 def __getattr__(name: str) -> Any:
-    """Imports what is asked for: torch and the kernels take two seconds, and a table of materials needs neither."""
+    """Import public names on first use: torch and the kernels take two seconds, and a material table needs neither."""
     if name in __all__:
         for module in map(importlib.import_module, (f"{__name__}.{module}" for module in _MODULES)):
             if name in vars(module):

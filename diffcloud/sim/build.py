@@ -1,4 +1,4 @@
-"""From a cloth mesh, a material and a surrounding to a System."""
+"""Builds a `System` from a cloth mesh, a material and its surroundings."""
 
 from __future__ import annotations
 
@@ -30,20 +30,20 @@ def build_system(
     order: Order = 2,
     shaped: bool = False,
 ) -> System:
-    """Assemble a System.
+    """Build a `System`.
 
     Args:
         time_step: [s].
-        mass_material: material whose density gives the node masses, where it differs from `material` (the published
-            experiments reload their tables after the masses were computed).
-        integrator: a key of `integrators.INTEGRATORS`. "implicit" is the converged step with smooth contact and rigid
-            bodies, "arcsim" is ARCSim's.
-        order: of the implicit integrator: 2 for BDF2, 1 for backward Euler, which scenes with rigid bodies always have.
-        shaped: whether the cloth's hinges are at rest as the mesh stands, not flat.
+        mass_material: its density gives the node masses; default `material`. The published experiments compute the masses
+            from one material and the forces from another.
+        integrator: a key of `integrators.INTEGRATORS`. "implicit" has smooth contact and rigid bodies, and iterates each
+            step to convergence. "arcsim" reproduces ARCSim.
+        order: of the implicit integrator: 2 for BDF2, 1 for backward Euler. Scenes with rigid bodies always use 1.
+        shaped: use the angles of the given mesh as rest angles of the hinges. Otherwise the cloth is flat at rest.
 
     Raises:
-        SceneError: a time step that is not positive, a handle on a node that does not exist, no such integrator, or a
-            surrounding that it cannot simulate.
+        SceneError: the time step is not positive, a handle's node does not exist, the integrator is unknown, or it cannot
+            simulate the surroundings.
     """
     surrounding = surrounding or Surrounding()
     if not time_step > 0:

@@ -1,4 +1,4 @@
-"""A batch of episodes: arrays for the kernels, one thread each, and what became of them."""
+"""Batches of simulations: converts tensors to arrays for the kernels, runs one thread per cloth and collects failures."""
 
 from __future__ import annotations
 
@@ -25,20 +25,20 @@ from diffcloud.sim.system import System
 from diffcloud.sim.threads import run_all
 
 FACTOR_MEMORY = 256 * 2**20
-"""[bytes] of factors that a batch keeps for its derivatives; beyond, the steps' factors are made again."""
+"""Memory for the matrix factors that a batch keeps for its derivatives [bytes]. Further factors are recomputed."""
 _BLOCK = 9 * 8
 
 _PROPERTIES = tuple(field.name for field in fields(Properties))
-"""Fields of `Parameters` that are of the cloth and not of a step."""
+"""Fields of `Parameters` that are constant over an episode."""
 
 
 class Batch:
-    """Episodes of one system. Inputs have a leading batch axis: positions and velocities [B, V, 3], poses of the bodies
-    [B, N, 18], the grippers' tracks [B, S, G, 3], and those of `Properties`."""
+    """A batch of B episodes of one system over S steps. Inputs have a leading batch axis: positions and velocities
+    [B, V, 3], poses of the N bodies [B, N, 18], tracks of the G grippers [B, S, G, 3], and the fields of `Properties`."""
 
     def __init__(self, system: System, steps: int, *, tracked: bool, progress: Callable[[int], None] | None = None) -> None:
         self.system, self.steps = system, steps
-        times = np.cumsum(np.full(steps, system.time_step))  # repeated addition, as the reference accumulates time
+        times = np.cumsum(np.full(steps, system.time_step))  # repeated addition, as ARCSim accumulates time
         self.schedule = system.handles.tracked_schedule(times) if tracked else system.handles.schedule(times)
         self.held = _held(system, self.schedule)
         all_times = np.concatenate([[0.0], times])
@@ -48,10 +48,14 @@ class Batch:
         self._progress = progress
 
     def simulate(self, inputs: Sequence[Tensor], *, keep: bool) -> tuple[Tensor, Tensor, Tensor]:
-        """Positions and velocities [B, S + 1, V, 3] and poses of the bodies [B, S + 1, N, 18]; `diverged` tells which hold.
+        """Simulate the batch. `diverged` lists the entries that failed.
 
         Args:
-            keep: what derivatives need.
+            inputs: as the class describes, in this order.
+            keep: store the matrix factors that derivatives need.
+
+        Returns:
+            Positions [B, S + 1, V, 3], velocities [B, S + 1, V, 3] and poses of the bodies [B, S + 1, N, 18].
         """
         self._inputs = [np.ascontiguousarray(tensor.detach().numpy()) for tensor in inputs]
         positions, velocities, poses, self._track, *properties = self._inputs
@@ -71,14 +75,14 @@ class Batch:
         return tuple(torch.from_numpy(array) for array in (self.positions, self.velocities, self.poses))  # type: ignore[return-value]
 
     def gradients(self, outputs: Sequence[Tensor]) -> list[Tensor]:
-        """Gradients by the inputs, from those by what `simulate` gave."""
+        """Gradients of a loss with respect to the inputs, given its gradients with respect to the results of `simulate`."""
         position, velocity, pose = (np.array(tensor.detach().numpy(), dtype=np.float64, order="C") for tensor in outputs)
         count = len(position)
         found = [np.zeros_like(array) for array in self._inputs]
 
         def job(entry: int) -> None:
             outcome = self._ends[entry]
-            done = outcome.step + 1  # what was not simulated has no derivative, not even zero times what it holds
+            done = outcome.step + 1  # steps after a failure hold NaN, so they are left out of the sweep
             gradients = Parameters(*(np.zeros_like(array) for array in self._parameters[entry]))
             states = (array[entry, :done] for array in (position, velocity, pose))
             self._integrator.reverse(
@@ -96,7 +100,7 @@ class Batch:
         return [torch.from_numpy(array) for array in found]
 
     def tangents(self, rates: Sequence[Tensor]) -> Tensor:
-        """d positions [K, B, S + 1, V, 3] along rates [K, B, ...] of the inputs."""
+        """Directional derivatives of the positions [K, B, S + 1, V, 3] along K directions [K, B, ...] of the inputs."""
         position, velocity, pose, track, *properties = (np.ascontiguousarray(tensor.numpy()) for tensor in rates)
         directions, count = position.shape[:2]
         found = np.empty((count, self.steps + 1, *position.shape[:1], *position.shape[2:]))
@@ -118,7 +122,7 @@ class Batch:
         return torch.from_numpy(np.moveaxis(found, 2, 0))
 
     def diverged(self) -> dict[int, DivergedError]:
-        """What is wrong with entries of the last simulation."""
+        """Batch entries whose last simulation failed or is implausible, each with its error."""
         found = {}
         for entry, outcome in enumerate(self._ends):
             fault = self._failed(entry, outcome) if outcome.status != status.DONE else None
@@ -133,7 +137,7 @@ class Batch:
     # --- arrays ------------------------------------------------------------------------------------------------------
 
     def _episode(self, entry: int, states: int | None = None) -> Episode:
-        """An entry's arrays, up to so many states."""
+        """Arrays of one batch entry, optionally only its first `states` states."""
         return Episode(
             self.held,
             self._parameters[entry],
@@ -146,13 +150,13 @@ class Batch:
         )
 
     def _over_time(self, first: Floats) -> Floats:
-        """[B, S + 1, ...] that begins with [B, ...]; the rest is NaN."""
+        """Allocate [B, S + 1, ...]. Fill the first state from [B, ...] and the others with NaN."""
         whole = np.full((len(first), self.steps + 1, *first.shape[1:]), np.nan)
         whole[:, 0] = first
         return whole
 
     def _read(self, properties: Sequence[Floats]) -> Parameters:
-        """Of one entry, in the order of `_PROPERTIES`."""
+        """Parameters of one batch entry, from arrays in the order of `_PROPERTIES`."""
         fields = dict(zip(_PROPERTIES, map(np.atleast_1d, properties), strict=True))
         inverse = np.zeros(self._integrator.points(self.system.scene))
         inverse[: len(fields["node_mass"])] = 1 / fields["node_mass"]
@@ -160,7 +164,7 @@ class Batch:
         return Parameters(**fields, inverse_mass=inverse, hold=np.zeros(handles), target=np.zeros((handles, 3)))
 
     def _read_rates(self, parameters: Parameters, properties: Sequence[Floats]) -> Parameters:
-        """The same with a leading axis K."""
+        """Derivatives of `_read` along K directions. Each array has a leading axis K."""
         flat = (np.ascontiguousarray(one.reshape(len(one), -1)) for one in properties)
         fields = dict(zip(_PROPERTIES, flat, strict=True))
         directions, nodes = fields["node_mass"].shape
@@ -181,7 +185,7 @@ class Batch:
 
         run_all([partial(job, entry) for entry in range(count)], look=look, stop=stop)
 
-    # --- what became of them -----------------------------------------------------------------------------------------
+    # --- failures ----------------------------------------------------------------------------------------------------
 
     def _failed(self, entry: int, outcome: Outcome) -> DivergedError:
         if outcome.status >= status.FIRST_OWN:
@@ -189,7 +193,7 @@ class Batch:
         return DivergedError(outcome.step + 1, [entry], "positions are not finite")
 
     def _course(self, entry: int, last: int) -> Course:
-        """The motion up to a step, for `implausible`."""
+        """Motion of one entry up to step `last`, as `implausible` takes it."""
         system, schedule = self.system, self.schedule
         followed = schedule.gripper >= 0
         translation = schedule.translation[:last].copy()
@@ -213,7 +217,7 @@ class Batch:
         )
 
     def _stored(self, entry: int, step: int) -> float:
-        """Elastic energy [J]."""
+        """Elastic energy after a step [J]."""
         return self._integrator.energy(self.system.scene, self._parameters[entry], self.positions[entry, step])
 
 
@@ -224,7 +228,7 @@ def _scenery(system: System) -> Scenery:
 
 
 def _held(system: System, schedule: HandleSchedule) -> Held:
-    """The schedule for kernels."""
+    """Convert the handle schedule to arrays for the kernels."""
     steps, count = schedule.strength.shape
     inverse: NDArray[np.float64] = np.zeros((count, 3, 3))
     for h, first in enumerate(schedule.first_step):

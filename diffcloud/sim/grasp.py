@@ -1,16 +1,16 @@
-"""How large a grasp is, and how it holds the cloth.
+"""Types and sizes of grasps, and the nodes and stiffness that they give a mesh.
 
-A node that is held alone is a point load: its compliance grows with the logarithm of the inverse edge length, without a
-limit. A *pad* holds all nodes inside a square alike. A *pivot* holds one node, and scales the stretching stiffness of the
-faces around it so that the node yields as a rigid square of the grasp's size would, which is free to turn:
+Holding a single node is a point load. Its compliance grows without limit as the mesh is refined, with log(1 / edge length).
+So a grasp has a size a [m]. A *pad* holds all nodes inside a square. A *pivot* holds one node and scales the stretching
+stiffness of the faces around it by s. The node then yields like a rigid, freely rotating square of side a:
 
-    1/s = 1 + (K/c) ln(g h / a),      h = edge length, a = size.
+    1/s = 1 + (K/c) ln(g h / a),      h = edge length.
 
-K belongs to the angle of cloth around the point: 2/(φ + sin φ) for a free corner or edge (Flamant), (1 + ν)(3 - ν)/(4π)
-inside. c is the share of the faces at the node in its compliance, g the size in edge lengths of the square that a node
-stands for. Both depend on how the faces meet there. Those of corners come from hanging sheets, the others from linear
-elasticity against rigid squares (`tests/sim/test_grasp.py`). Where edges are shorter than the square, the faces inside it
-are made `_RIGID` times as stiff instead.
+K depends on the angle φ of cloth around the point: 2/(φ + sin φ) for a free corner or edge (Flamant's solution), and
+(1 + ν)(3 - ν)/(4π) inside the cloth, with Poisson's ratio ν. c is the share of these faces in the node's compliance. g is
+the side, in edge lengths, of the square that the node represents. c and g depend on how many faces meet at the node. At
+corners they were fitted to hanging sheets, elsewhere to linear elasticity with rigid squares (`tests/sim/test_grasp.py`).
+If the edges are shorter than the square, all faces inside the square become `_RIGID` times as stiff instead.
 """
 
 from __future__ import annotations
@@ -26,36 +26,35 @@ from diffcloud.errors import SceneError
 from diffcloud.mesh.topology import ClothMesh, FloatArray, IntArray
 
 Grip = Literal["pad", "upright_pad", "pivot"]
-"""A pad keeps the cloth's direction: as it lies ("pad", fingers level), or turned up at the start ("upright_pad", pinched
-from above). A pivot lets it turn."""
+"""Type of grasp. "pad": fingers level, the cloth keeps its direction. "upright_pad": the cloth is pinched from above and
+turned up at the start. "pivot": the cloth can rotate about the grasp."""
 GRIP_M = 0.02
-"""Size of a grasp where none is stated: about that of the pads of a Robotiq 2F-85 [m]."""
+"""Default size of a grasp [m], about the pad width of a Robotiq 2F-85 gripper."""
 _RIGID = 30.0
-"""The compliance of a pivot is then within a tenth of a rigid square's, in most meshes within a twentieth."""
+"""Stiffness factor of the faces inside a pivot. Its compliance is then within 10 % of a rigid square's, mostly within 5 %.
+"""
 _LEAST = 0.09
-"""Of 1/s, where the formula holds: beyond, edges are shorter than the square."""
+"""Smallest 1/s for which the formula holds. Below it, the edges are shorter than the square."""
 _TOLERANCE = 1e-9
 _POINTS: tuple[tuple[float, float, tuple[tuple[int, float, float], ...]], ...] = (
     (math.pi / 2, 0.81, ((2, 1.38, 0.20), (1, 1.0, 0.295))),
     (math.pi, 0.64, ((4, 0.88, 0.29), (2, 0.74, 0.37))),
     (2 * math.pi, 0.27, ((8, 0.39, 0.35), (4, 0.35, 0.40))),
 )
-"""Angle of cloth around the point [rad], K, and for so many faces there c and g [1]; isotropic, K and c times 1/(E h)."""
+"""Angle of cloth around the point [rad], K, and (number of faces at the node, c, g) for each type of mesh. For an isotropic
+sheet of thickness h, K and c are in units of 1/(E h)."""
 
 
 @dataclass(frozen=True)
 class Grasp:
-    """What holds the cloth at each held place."""
+    """Type and size of every grasp in a scene."""
 
     kind: Grip
     size: float
     """Side of the square [m]."""
 
     def described(self, nodes: int) -> str:
-        """
-        Args:
-            nodes: that are held.
-        """
+        """Text that describes the grasp, for `nodes` held nodes."""
         size = f"{1e3 * self.size:.3g} mm"
         if self.kind == "pivot":
             return f"pivot of {size}"
@@ -63,10 +62,11 @@ class Grasp:
 
 
 def window(place: FloatArray, low: FloatArray, high: FloatArray, size: float) -> tuple[FloatArray, FloatArray]:
-    """The square of a pad around a place: centred there, and moved inwards where it would leave the cloth.
+    """Square of a pad around a point, shifted inwards where it would extend beyond the cloth.
 
     Args:
-        place, low, high: [2] in material space; the last two are corners of the rectangle around the cloth [m].
+        place: [2] centre in material space [m].
+        low, high: [2] corners of the cloth's bounding rectangle [m].
 
     Returns:
         Its lower and upper corner [2].
@@ -76,16 +76,16 @@ def window(place: FloatArray, low: FloatArray, high: FloatArray, size: float) ->
 
 
 def inside(places: FloatArray, lower: FloatArray, upper: FloatArray) -> IntArray:
-    """Numbers of the places [N, 2] in a rectangle, its border included."""
+    """Indices of the points [N, 2] that are inside a rectangle or on its border."""
     slack = _TOLERANCE * float(np.abs(upper).max() + 1)
     return np.flatnonzero(((places >= lower - slack) & (places <= upper + slack)).all(axis=1))
 
 
 def nodes_under_pad(mesh: ClothMesh, node: int, size: float) -> list[int]:
-    """Nodes of any mesh that a pad at a node holds, the node among them; on a seam, those of all its patches.
+    """Nodes that a pad centred at a node holds, including this node. On a seam, all patches that meet there are searched.
 
     Raises:
-        SceneError: a pad that is as large as the cloth, or that holds the node alone.
+        SceneError: the pad is as large as the cloth, or contains no other node.
     """
     found = {node}
     for patch, lower, upper in _squares(mesh, node, size):
@@ -105,7 +105,7 @@ def nodes_under_pad(mesh: ClothMesh, node: int, size: float) -> list[int]:
 
 
 def _squares(mesh: ClothMesh, node: int, size: float) -> list[tuple[FloatArray, FloatArray, FloatArray]]:
-    """For each of a node's verts: the verts of its patch of material space [N, 2], and `window` around it there."""
+    """For each vert of a node: the verts of its patch in material space [N, 2], and the pad's `window` around the vert."""
     from scipy.sparse import coo_array  # slow to import
     from scipy.sparse.csgraph import connected_components
 
@@ -122,11 +122,11 @@ def _squares(mesh: ClothMesh, node: int, size: float) -> list[tuple[FloatArray, 
 
 
 def turned_up(places: FloatArray, low: FloatArray, high: FloatArray) -> FloatArray:
-    """[N, 3] displacement of a pad's nodes by a quarter turn, about the line at the pad's inner end, that lifts the rim.
+    """Displacement [N, 3] of a pad's nodes that lifts the rim by a quarter turn about the pad's inner edge.
 
     Args:
-        places: [N, 2] of the nodes in material space, the third axis being the cloth's normal [m].
-        low, high: [2] corners of the rectangle around the cloth.
+        places: [N, 2] nodes in material space [m]. The third axis of the result is the cloth's normal.
+        low, high: [2] corners of the cloth's bounding rectangle [m].
 
     Raises:
         SceneError: the pad is not at the rim.
@@ -144,11 +144,12 @@ def turned_up(places: FloatArray, low: FloatArray, high: FloatArray) -> FloatArr
 
 
 def stretching_factors(mesh: ClothMesh, nodes: Sequence[int], grasp: Grasp | None) -> FloatArray:
-    """[F] on the stretching stiffness of each face: 1 except around the nodes of a pivot. Held nodes side by side are no
-    point load, and have none.
+    """Factor [F] on the stretching stiffness of each face: 1, except around the nodes of a pivot.
+
+    Held nodes that share a face are not point loads, so their faces keep the factor 1.
 
     Args:
-        nodes: that are held.
+        nodes: the held nodes.
     """
     factors = np.ones(len(mesh.faces))
     if grasp is None or grasp.kind != "pivot":

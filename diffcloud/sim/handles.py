@@ -1,10 +1,10 @@
 """Handles: nodes that a gripper holds or moves.
 
-A handle pulls its node to the target x*(t) = translation(t) + linear(t) x̂, where the anchor x̂ is the node's position,
-taken back through the motion, at the step in which the handle becomes active. A *soft* handle is a spring with energy
-strength · k_h |x - x*|²/2 (ARCSim); a *hard* one prescribes the position.
+A handle pulls its node to the target x*(t) = translation(t) + linear(t) x̂. The anchor x̂ is the node's position when the
+handle becomes active, mapped back through the inverse motion. A *soft* handle is a spring with energy strength · k_h
+|x - x*|²/2, as in ARCSim. A *hard* handle prescribes the position.
 
-The published scenes put a static and a moving soft handle on the same node, which then follows the midpoint of both.
+In the published scenes, a static and a moving soft handle act on the same node, which then follows their midpoint.
 """
 
 from __future__ import annotations
@@ -20,50 +20,50 @@ from diffcloud.sim.motion import Motion
 
 _FADE_EPSILON = 1e-6
 _TURN_S = 0.2
-"""In which a pad turns up what it holds, from `start` on: twice the time of a usual frame."""
+"""Time in which an upright pad turns the cloth up after the handle's `start` [s]: two frames of a typical recording."""
 
 
 @dataclass(frozen=True)
 class Handle:
-    """One held node."""
+    """A held node."""
 
     node: int
     motion: Motion | None = None
     start: float = 0.0
     end: float = float("inf")
     fade: float = 0.0
-    """Seconds over which a soft handle lets go after `end`."""
+    """Duration over which a soft handle releases its node after `end` [s]."""
     gripper: str = "gripper"
-    """Which one moves the node, if one does."""
+    """Name of the gripper that moves the node. Not used without a motion."""
     pad: int = 0
-    """Number of the pad that holds the node: what lies between nodes of one pad is held like them."""
+    """Number of the pad that holds the node. Cloth between nodes of the same pad is also held."""
     turned: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """By how much an upright pad displaces the node, beside its motion [m]."""
+    """Displacement of the node by an upright pad, in addition to its motion [m]."""
 
     def turning(self, times: NDArray[np.float64]) -> NDArray[np.float64]:
-        """[S, 3] of `turned` at times [S], with a smooth start and end."""
+        """Displacement [S, 3] by `turned` at times [S] [s], smoothly increasing from zero."""
         done = np.clip((times - self.start) / _TURN_S, 0, 1)
         return (done**3 * (10 - 15 * done + 6 * done**2))[:, None] * np.array(self.turned)
 
 
 @dataclass(frozen=True)
 class HandleSchedule:
-    """Handles at the S steps of one run (at the end of each step)."""
+    """State of all handles at the end of each of S steps."""
 
     strength: NDArray[np.float64]
-    """[S, H] in [0, 1]."""
+    """[S, H] relative stiffness in [0, 1]; 0 is inactive."""
     linear: NDArray[np.float64]
     """[S, H, 3, 3] scale times rotation."""
     translation: NDArray[np.float64]
-    """[S, H, 3] [m]; of handles that follow a gripper's track, what comes on top of it."""
+    """[S, H, 3] [m]. For handles that follow a gripper's track, only the displacement in addition to the track."""
     first_step: NDArray[np.int64]
-    """[H] the step index (from 0) that takes the anchor; S where none does."""
+    """[H] index from 0 of the step at whose start the anchor is set; S if the node's initial position is the anchor."""
     gripper: NDArray[np.int64]
-    """[H] whose track the handle follows, a number in `Handles.grippers`; -1: none."""
+    """[H] index in `Handles.grippers` of the track that the handle follows; -1 for none."""
 
     @property
     def active(self) -> NDArray[np.bool_]:
-        """[S, H]"""
+        """[S, H] True where a handle holds its node."""
         return self.strength > 0
 
 
@@ -73,10 +73,10 @@ class Handles:
 
     handles: tuple[Handle, ...]
     stiffness: float = 1e3
-    """k_h of soft handles [N/m]."""
+    """Spring constant k_h of soft handles [N/m]."""
     hard: bool = False
     grasp: Grasp | None = None
-    """What the held nodes stand for; None: nodes, as they are."""
+    """Type and size of the grasp; None if handles hold single nodes."""
 
     def __post_init__(self) -> None:
         nodes = [handle.node for handle in self.handles]
@@ -89,16 +89,16 @@ class Handles:
 
     @property
     def moving(self) -> NDArray[np.bool_]:
-        """[H] those with a motion."""
+        """[H] True for handles with a motion."""
         return np.array([handle.motion is not None for handle in self.handles], dtype=np.bool_)
 
     @property
     def grippers(self) -> tuple[str, ...]:
-        """Those that move nodes, in the order of the handles."""
+        """Names of the grippers that move nodes, in the order of the handles."""
         return tuple(dict.fromkeys(handle.gripper for handle in self.handles if handle.motion is not None))
 
     def schedule(self, times: NDArray[np.float64]) -> HandleSchedule:
-        """Strength and targets at the end of each step, times [S] [s], as the scene says."""
+        """Strength and targets at the end of each step, at times [S] [s], from the scene's own motions."""
         shape = (len(times), len(self.handles))
         strength, translation = np.zeros(shape), np.zeros((*shape, 3))
         linear = np.broadcast_to(np.eye(3), (*shape, 3, 3)).copy()
@@ -114,11 +114,11 @@ class Handles:
         return HandleSchedule(strength, linear, translation, first, np.full(len(self.handles), -1))
 
     def own_track(self, times: NDArray[np.float64]) -> NDArray[np.float64]:
-        """[S, G, 3] displacement of each gripper since the start at the end of each step, times [S] [s], as the scene says.
+        """Displacement [S, G, 3] of each gripper since the start, at times [S] [s], from the scene's own motions [m].
 
         Raises:
-            SceneError: a gripper turns what it holds, moves its nodes in different ways, begins later, or moves a node that
-                another handle keeps in place: as a track, that would be another motion.
+            SceneError: the motion is more than a translation: a gripper rotates, moves its nodes differently, starts late,
+                or shares a node with a static handle.
         """
         level = replace(self, handles=tuple(replace(handle, turned=Handle.turned) for handle in self.handles))
         schedule = level.schedule(times)
@@ -138,7 +138,7 @@ class Handles:
         return found
 
     def tracked_schedule(self, times: NDArray[np.float64]) -> HandleSchedule:
-        """The schedule with moving handles displaced as their grippers are, from where their nodes start.
+        """Schedule in which moving handles follow a recorded gripper track from their nodes' initial positions.
 
         Raises:
             SceneError: no handle moves.
@@ -151,11 +151,11 @@ class Handles:
         for index in np.flatnonzero(self.moving):
             schedule.translation[:, index] = self.handles[index].turning(times)
         schedule.linear[:, self.moving] = np.eye(3)
-        # static twins of moving handles go: together they would hold the node half-way
+        # A static handle on the same node is disabled: the node would otherwise follow the midpoint of both.
         held = {handle.node for handle in self.handles if handle.motion is not None}
         twins = [handle.motion is None and handle.node in held for handle in self.handles]
         schedule.strength[:, twins] = 0.0
-        # a node's own start is its anchor; ARCSim's rule would take it one step late and lag behind the gripper
+        # The anchor is the node's initial position. ARCSim sets it one step later, so its node would trail the gripper.
         first = np.where(self.moving, len(times), schedule.first_step)
         names = self.grippers
         gripper = [-1 if handle.motion is None else names.index(handle.gripper) for handle in self.handles]

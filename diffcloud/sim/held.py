@@ -1,9 +1,11 @@
-"""Handles inside kernels: where each wants its node in a step, and derivatives of that.
+"""Handles in the kernels: targets of the held nodes, and the derivatives of these targets.
 
     anchor x̂ = L⁻¹(t₀) (x(t₀) - s(t₀)),    target x*(t) = s(t) + L(t) x̂,    s = translation (+ its gripper's track)
 
-t₀ is the step in which the handle becomes active; a handle that never does, or that follows a track, is anchored where its
-node starts. (`handles` has the schedule.)
+t₀ is the step in which the handle becomes active. If a handle never does, or follows a track, its anchor is the node's
+initial position. `handles` computes the schedule.
+
+Functions `*_reverse` propagate the gradient of a loss backwards. Functions `*_tangent` propagate K directional derivatives.
 """
 
 from __future__ import annotations
@@ -17,30 +19,30 @@ from diffcloud.sim.compiled.data import Floats, Ints, Parameters
 
 
 class Held(NamedTuple):
-    """Handles over the S steps of a run."""
+    """Schedule of H handles over S steps, as arrays. `handles.HandleSchedule` has the same fields."""
 
     node: Ints
-    """[H]"""
+    """[H] index of the held node."""
     hard: bool
     stiffness: float
-    """k_h [N/m]"""
+    """Spring constant k_h [N/m]."""
     strength: Floats
-    """[S, H] in [0, 1]."""
+    """[S, H] relative stiffness in [0, 1]."""
     linear: Floats
-    """[S, H, 3, 3]"""
+    """[S, H, 3, 3] scale times rotation."""
     translation: Floats
-    """[S, H, 3] [m]"""
+    """[S, H, 3] translation [m]."""
     first_step: Ints
-    """[H] the step that takes the anchor; S: none does."""
+    """[H] index of the step that sets the anchor; S if no step does."""
     inverse: Floats
-    """[H, 3, 3] of the linear part in that step."""
+    """[H, 3, 3] inverse of the linear part in this step."""
     gripper: Ints
-    """[H] whose track a handle follows; -1: none."""
+    """[H] index of the gripper whose track the handle follows; -1 for none."""
 
 
 @kernel
 def first_anchors(held: Held, positions: Floats) -> Floats:
-    """[H, 3] where the nodes start, positions [V, 3]."""
+    """Initial positions [H, 3] of the held nodes, from positions [V, 3]."""
     anchors = np.empty((len(held.node), 3))
     for h in range(len(held.node)):
         for axis in range(3):
@@ -50,7 +52,7 @@ def first_anchors(held: Held, positions: Floats) -> Floats:
 
 @kernel
 def take_anchors(held: Held, track: Floats, step: int, positions: Floats, anchors: Floats) -> None:
-    """Anchors [H, 3] of the handles that become active in this step; the track is [S, G, 3] of G grippers."""
+    """Set the anchors [H, 3] of the handles that become active in this step. The track is [S, G, 3] for G grippers."""
     for h in range(len(held.node)):
         if held.first_step[h] == step:
             for axis in range(3):
@@ -62,7 +64,7 @@ def take_anchors(held: Held, track: Floats, step: int, positions: Floats, anchor
 
 @kernel
 def aim(held: Held, track: Floats, step: int, anchors: Floats, parameters: Parameters) -> None:
-    """Stiffness and targets of the handles at the end of a step, into the parameters."""
+    """Write stiffness and target of each handle at the end of a step into `parameters`."""
     for h in range(len(held.node)):
         parameters.hold[h] = 0.0 if held.hard else held.stiffness * held.strength[step, h]
         for axis in range(3):
@@ -73,7 +75,7 @@ def aim(held: Held, track: Floats, step: int, anchors: Floats, parameters: Param
 
 @kernel
 def holders(held: Held, step: int, nodes: int) -> Ints:
-    """[V] the handle that prescribes each node in a step; -1: none."""
+    """[V] index of the hard handle that prescribes each node in a step; -1 for none."""
     found = np.full(nodes, -1, np.int64)
     if held.hard:
         for h in range(len(held.node)):
@@ -84,7 +86,7 @@ def holders(held: Held, step: int, nodes: int) -> Ints:
 
 @kernel
 def aim_reverse(held: Held, step: int, target: Floats, anchors: Floats, track: Floats) -> None:
-    """From the gradients by the targets [H, 3] to those by the anchors and the track [S, G, 3]."""
+    """Add to the gradients of the anchors and of the track [S, G, 3], given the gradient of the targets [H, 3]."""
     for h in range(len(held.node)):
         for axis in range(3):
             slope = target[h, axis]
@@ -97,7 +99,7 @@ def aim_reverse(held: Held, step: int, target: Floats, anchors: Floats, track: F
 
 @kernel
 def take_anchors_reverse(held: Held, step: int, anchors: Floats, positions: Floats, track: Floats) -> None:
-    """From the gradients by the anchors that this step takes to those by positions [V, 3] and the track."""
+    """Move the gradient of the anchors that this step sets to the gradients of positions [V, 3] and of the track."""
     for h in range(len(held.node)):
         if held.first_step[h] == step:
             for k in range(3):
@@ -112,7 +114,7 @@ def take_anchors_reverse(held: Held, step: int, anchors: Floats, positions: Floa
 
 @kernel
 def first_anchors_reverse(held: Held, anchors: Floats, positions: Floats) -> None:
-    """Adds the gradients by the anchors that no step took to those by the first positions [V, 3]."""
+    """Add the gradient of the remaining anchors to that of the initial positions [V, 3]."""
     for h in range(len(held.node)):
         for axis in range(3):
             positions[held.node[h], axis] += anchors[h, axis]
@@ -120,7 +122,7 @@ def first_anchors_reverse(held: Held, anchors: Floats, positions: Floats) -> Non
 
 @kernel
 def take_anchors_tangent(held: Held, track: Floats, step: int, positions: Floats, anchors: Floats) -> None:
-    """Rates of the anchors [K, H, 3] that this step takes, from those of the track [K, S, G, 3] and of positions
+    """Derivatives [K, H, 3] of the anchors that this step sets, from those of the track [K, S, G, 3] and positions
     [K, V, 3]."""
     for h in range(len(held.node)):
         if held.first_step[h] == step:
@@ -136,7 +138,7 @@ def take_anchors_tangent(held: Held, track: Floats, step: int, positions: Floats
 
 @kernel
 def aim_tangent(held: Held, track: Floats, step: int, anchors: Floats, target: Floats) -> None:
-    """Rates of the targets [K, H, 3]."""
+    """Write the derivatives of the targets [K, H, 3]."""
     for d in range(len(anchors)):
         for h in range(len(held.node)):
             for axis in range(3):

@@ -1,7 +1,7 @@
-"""What an integrator is to the simulation, and the integrators by name.
+"""The interface of a time integrator, and the integrators by name.
 
-An integrator is an object with the methods of `Integrator`, called `INTEGRATOR`, in a module of its own, and a line in
-`INTEGRATORS`. Its module is imported when a system is first built with it, so that nothing here depends on it.
+To add an integrator, write a module whose constant `INTEGRATOR` has the methods of `Integrator`, and list the module in
+`INTEGRATORS`. It is imported on first use, so this package does not depend on it.
 """
 
 from __future__ import annotations
@@ -22,136 +22,131 @@ INTEGRATORS = {
     "implicit": "diffcloud.sim.implicit.integrator",
     "arcsim": "diffcloud.arcsim.integrator",
 }
-"""Name -> module."""
+"""Name of each integrator -> its module."""
 
 
 class Episode(NamedTuple):
-    """The arrays of one cloth's episode: S steps, V nodes, O points of obstacles, B bodies, H handles, G grippers."""
+    """The arrays of one simulation: S steps, V nodes, O obstacle points, B bodies, H handles, G grippers."""
 
     held: Held
     parameters: Parameters
     track: Floats
     """[S, G, 3] displacement of each gripper at the end of each step [m]."""
     scenery: Floats
-    """[S + 1, O, 3] points of obstacles at the steps' times [m]."""
+    """[S + 1, O, 3] obstacle points at the start and after each step [m]."""
     anchors: Floats
-    """[H, 3] of the handles [m]; `simulate` takes them."""
+    """[H, 3] anchors of the handles [m]; `simulate` fills them."""
     positions: Floats
-    """[S + 1, V, 3] [m]"""
+    """[S + 1, V, 3] node positions [m]."""
     velocities: Floats
-    """[S + 1, V, 3] [m/s]"""
+    """[S + 1, V, 3] node velocities [m/s]."""
     bodies: Floats
-    """[S + 1, B, 18] centre [m], orientation row by row, velocity [m/s], angular velocity [rad/s]."""
+    """[S + 1, B, 18] centre [m], rotation matrix in row-major order, velocity [m/s], angular velocity [rad/s]."""
 
 
 class Outcome(NamedTuple):
-    """How an episode ended, and what its derivatives need."""
+    """How a simulation ended, and the data that its derivatives need."""
 
     status: int
-    """As of `status`."""
+    """One of the numbers in `status`, or of the integrator's own."""
     step: int
-    """The step in which it ended; S where it was completed."""
+    """Index of the step in which the simulation ended; S if it completed."""
     kept: Any
-    """What only the integrator reads."""
+    """Data for the derivatives, private to the integrator."""
     fault: Floats | None = None
-    """Numbers about a failure, which only the integrator reads."""
+    """Data about a failure, private to the integrator."""
 
 
 class Derivatives(NamedTuple):
-    """Gradients of a loss by an episode's arrays, or how these change along K directions."""
+    """Gradients of a loss with respect to an episode's arrays, or derivatives of these arrays along K directions."""
 
     parameters: Parameters
-    """Gradients, or rates with a leading axis K."""
+    """Gradients, or derivatives with a leading axis K."""
     track: Floats
-    """[S, G, 3], or [K, S, G, 3]."""
+    """[S, G, 3] gradients, or [K, S, G, 3] derivatives."""
     positions: Floats
-    """[S + 1, V, 3], or [S + 1, K, V, 3]."""
+    """[S + 1, V, 3] gradients, or [S + 1, K, V, 3] derivatives."""
     velocities: Floats
-    """As the positions."""
+    """Shape as of `positions`."""
     bodies: Floats
-    """[S + 1, B, 18], or [S + 1, K, B, 18]."""
+    """[S + 1, B, 18] gradients, or [S + 1, K, B, 18] derivatives."""
 
 
 @runtime_checkable
 class Integrator(Protocol):
-    """A time stepping scheme with its contact and its derivatives.
-
-    `simulate`, `reverse` and `tangents` treat one cloth. They run in several threads at once and must release the
-    interpreter's lock, as kernels do.
-    """
+    """A time stepping scheme with its contact model and its derivatives. `simulate`, `reverse` and `tangents` process one
+    cloth. Several threads call them at once, so they must release Python's global interpreter lock, as kernels do."""
 
     name: str
     """Its key in `INTEGRATORS`."""
     terms: tuple[Term, ...]
-    """Forces whose elements are known before the motion."""
+    """Forces on elements that are fixed before the simulation, such as faces and hinges."""
     contacts: tuple[Term, ...]
-    """Forces between points that each step finds."""
+    """Contact forces, whose point pairs each step detects."""
     smooth: bool
-    """Whether derivatives hold over finite changes of the parameters. Fits then step by tangents and fit nuisance
-    variables by default; else they use finite differences."""
+    """Whether derivatives predict finite changes of the parameters. If so, fits use tangents and estimate nuisance
+    variables by default. Otherwise fits use finite differences."""
     meshes: bool
-    """Whether its own contact stops the cloth at obstacles that are no planes."""
+    """Whether its contact model also handles obstacles that are not planes."""
 
     def check(self, surrounding: Surrounding) -> None:
-        """
+        """Check that this integrator can simulate the surroundings.
+
         Raises:
-            SceneError: the surrounding has something that this integrator cannot simulate.
+            SceneError: it cannot.
         """
 
     def with_contact(self, surrounding: Surrounding) -> Surrounding:
-        """The same surrounding with the contact that is this integrator's own."""
+        """Return the surroundings with the default contact model of this integrator."""
 
     def resting_height(self, contact: ContactSettings, weight: float) -> float:
-        """Distance from a level obstacle at which contact carries a cloth of that weight per area [N/m²], above 0 [m]."""
+        """Height above a level obstacle at which contact supports a cloth of weight `weight` per area [N/m²], above 0
+        [m]."""
 
     def build(self, setup: Setup, time_step: float) -> Any:
-        """What the kernels are given: everything that is constant in a run with steps of that length [s]."""
+        """Build the constant data for the kernels, for steps of `time_step` [s]."""
 
     def points(self, scene: Any) -> int:
-        """How many points of cloth, obstacles and bodies forces know: the length of `Parameters.inverse_mass`."""
+        """Number of points of cloth, obstacles and bodies: the length of `Parameters.inverse_mass`."""
 
     def simulate(self, scene: Any, episode: Episode, keep: int, control: Ints) -> Outcome:
-        """Fill an episode from its start.
+        """Simulate an episode in place.
 
         Args:
-            scene: what `build` gave.
-            episode: the first rows of positions, velocities and bodies are the start; the others are taken.
-            keep: rows of factors [9] that may be kept for the derivatives; below zero: nothing is kept.
-            control: [2] finished steps are added to the first; the second one stops the run when it is not zero.
+            scene: result of `build`.
+            episode: the first rows of positions, velocities and bodies are the initial state; the other rows are written.
+            keep: how many rows of factors [9] may be stored for the derivatives; negative to store nothing.
+            control: [2] the first number counts finished steps. If another thread sets the second one, the run stops.
         """
 
     def reverse(self, scene: Any, episode: Episode, outcome: Outcome, gradients: Derivatives) -> None:
-        """Sweep gradients backwards through an episode (the adjoint).
+        """Propagate gradients backwards through an episode (adjoint method).
 
         Args:
-            episode: as `simulate` left it, without the steps that it did not finish.
-            gradients: by the states after each step, which are overwritten: the first rows take those by the start. The
-                parameters and the track are zeros and take the sums over all steps.
+            episode: as `simulate` left it, without the unfinished steps.
+            gradients: with respect to the states after each step. They are overwritten: the first rows receive the gradient
+                of the initial state. Parameters and track must be zero, and receive the sums over all steps.
         """
 
     def tangents(self, scene: Any, episode: Episode, outcome: Outcome, rates: Derivatives) -> None:
-        """Carry K directions through an episode.
+        """Propagate K directional derivatives forward through an episode.
 
         Args:
             episode: as `simulate` left it.
-            rates: of the parameters, the track, and the start in the first rows of the states; the other rows are taken.
-                `hold` is zero, `target` is room.
+            rates: derivatives of the parameters, the track and, in the first rows, the initial state. The other rows are
+                written. `hold` must be zero. `target` is scratch space.
         """
 
     def energy(self, scene: Any, parameters: Parameters, positions: Floats) -> float:
-        """Elastic energy of a cloth whose nodes are at positions [V, 3], with constant damping [J]."""
+        """Elastic energy of a cloth at node positions [V, 3] [J]."""
 
     def fault(self, entry: int, episode: Episode, outcome: Outcome) -> DivergedError:
-        """What is wrong with an episode whose status is one of the integrator's own.
-
-        Args:
-            entry: of the batch, for the message.
-        """
+        """Error for batch entry `entry`, whose episode ended with one of the integrator's own status numbers."""
 
 
 @cache
 def load_integrator(name: str) -> Integrator:
-    """An integrator by its name; its module is imported when it is first asked for.
+    """Return an integrator by name, and import its module if necessary.
 
     Raises:
         SceneError: no such integrator.
@@ -169,4 +164,4 @@ def _known(name: str) -> str:
 
 
 IntegratorName = Annotated[str, AfterValidator(_known)]
-"""A field of a file that names an integrator."""
+"""Type of a configuration field that names an integrator."""

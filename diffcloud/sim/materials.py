@@ -1,20 +1,20 @@
 """Cloth materials: the data-driven tables of Wang, O'Brien and Ramamoorthi (2011) as ARCSim stores them.
 
-`stretching` [6, 4]: columns are the coefficients (k0: uu, k1: uu-vv coupling, k2: vv, k3: shear). Row 0 holds them at
-zero strain, rows 1..5 at the reference strain for stretch directions 0, 22.5, 45, 67.5, 90 degrees from u. ARCSim
-doubles each entry, so a constant table entry S gives a stretching stiffness of 2 S [N/m] (force per width per strain).
+`stretching` [6, 4]: columns are the coefficients (k0: uu, k1: uu-vv coupling, k2: vv, k3: shear). Row 0 holds them at zero
+strain, rows 1..5 at the reference strain for stretch directions 0, 22.5, 45, 67.5, 90 degrees from u. ARCSim doubles each
+entry, so a constant table entry S gives a stretching stiffness of 2 S [N/m] (force per width per strain).
 
 `bending` [3, 5]: rows are edge directions 0, 45, 90 degrees in material space, columns are curvature bins. An entry k_b
-[N·m] enters the hinge energy k_b l² θ² / (8 (a0 + a1)). What that means as a bending stiffness per width B depends on
-the mesh, as with every hinge model. Take a grid of right triangles with side h and z = (a x² + 2 b x y + c y²)/2: edges
-along y turn by (a - b) h, along x by (c - b) h, diagonals by √2 b h, so the energy per area is
+[N·m] enters the hinge energy k_b l² θ² / (8 (a0 + a1)), with edge length l, angle θ and face areas a0 and a1. As in every
+hinge model, the bending stiffness per width B that results depends on the mesh. Take a grid of right triangles with side h
+and the shape z = (a x² + 2 b x y + c y²)/2. Edges along y turn by (a - b) h, along x by (c - b) h, diagonals by √2 b h, so
+the energy per area is
 
     k_b/2 · [(a - b)²/4 + (c - b)²/4 + b²].
 
-Held to a cylinder about a grid axis (b = c = 0) this is B a²/2 with B = k_b / 4. A strip with free edges, which is what a
-cantilever test (ASTM D1388) or a hanging cloth shows, relaxes to b = c = a/5, and **B = k_b / 5**; a grid with alternating
-diagonals arrives at the same number through its own relaxation. The tests check both: the energy of a cylinder, and the
-heavy elastica under mesh refinement.
+On a cylinder about a grid axis (b = c = 0) this is B a²/2 with B = k_b / 4. A strip with free edges, as in a cantilever
+test (ASTM D1388) or a hanging cloth, relaxes to b = c = a/5, and **B = k_b / 5**. A grid with alternating diagonals relaxes
+to the same value. The tests check both cases: the energy of a cylinder, and the heavy elastica under refinement.
 """
 
 from __future__ import annotations
@@ -38,20 +38,20 @@ _LEAST = 1e-300
 
 @dataclass(frozen=True)
 class Material:
-    """One fabric. Tables as described in the module's docstring."""
+    """One fabric, with tables as the module's docstring describes them."""
 
     name: str
     density: float
-    """[kg/m²]"""
+    """Mass per area [kg/m²]."""
     stretching: NDArray[np.float64]
-    """[6, 4] [N/m], half of the stiffness."""
+    """[6, 4] table [N/m]; entries are half of the stiffness."""
     bending: NDArray[np.float64]
-    """[3, 5] [N·m]"""
+    """[3, 5] table [N·m]."""
     damping: float = 0.0
     """Stiffness-proportional damping [s]."""
     compression: float = 1.0
-    """In [0, 1]: the part of its stretching stiffness with which it resists compression in its plane. Below 1 it wrinkles
-    finer than its mesh (`terms/wrinkling.py`)."""
+    """Fraction in [0, 1] of the stretching stiffness that resists compression. Below 1, the cloth model includes wrinkles
+    that are finer than the mesh (`terms/wrinkling.py`)."""
     source: str = ""
 
     def __post_init__(self) -> None:
@@ -78,13 +78,13 @@ class Material:
 
     @property
     def wrinkles(self) -> bool:
-        """Whether it gives way to compression."""
+        """Whether the material resists compression less than stretching."""
         return self.compression < 1
 
     def scaled(
         self, *, density: float = 1.0, stretching: float = 1.0, shear: float = 1.0, bending: float = 1.0
     ) -> Material:
-        """The same material with its tables multiplied, and the shear of the stretching table once more."""
+        """Return a copy with scaled density and tables. `shear` scales the shear column in addition to `stretching`."""
         return replace(
             self,
             density=self.density * density,
@@ -94,8 +94,8 @@ class Material:
 
     @property
     def resting_stretching_stiffness(self) -> float:
-        """Force per width per strain at rest of a strip whose sides are free [N/m], mean of both directions: what a
-        multiplier of 1 means in SI."""
+        """Force per width per strain [N/m] of a strip with free sides at zero strain, mean of both directions. This is the
+        SI value of a multiplier of 1."""
         k0, k1, k2 = (float(entry) for entry in self.stretching[0, :3])
         coupled = k1**2 / max(k0, _LEAST) + k1**2 / max(k2, _LEAST)
         return TABLE_ENTRY_TO_STRETCHING * 0.5 * (k0 + k2 - coupled)
@@ -107,18 +107,18 @@ class Material:
 
     @property
     def resting_shear_part(self) -> float:
-        """Shear stiffness divided by stretching stiffness, at rest: 0.5 of an isotropic sheet without coupling [-]."""
+        """Ratio of shear stiffness to stretching stiffness at zero strain [-]; 0.5 for an isotropic sheet with ν = 0."""
         return self.resting_shear_stiffness / max(self.resting_stretching_stiffness, _LEAST)
 
     @property
     def resting_poisson_ratio(self) -> float:
-        """By how much a strip at rest contracts across for each part it is stretched along, mean of both directions."""
+        """Poisson's ratio at zero strain, mean of both directions [-]."""
         k0, k1, k2 = (float(entry) for entry in self.stretching[0, :3])
         return 0.5 * (k1 / max(k0, _LEAST) + k1 / max(k2, _LEAST))
 
     @property
     def resting_bending_stiffness(self) -> float:
-        """Mean of the flat-state bending column, as a stiffness per width B [N·m]."""
+        """Bending stiffness per width B of the flat cloth, mean of the edge directions [N·m]."""
         return TABLE_ENTRY_TO_BENDING * float(self.bending[:, 0].mean())
 
 
@@ -134,22 +134,22 @@ def isotropic(
     damping: float = 0.0,
     source: str = "",
 ) -> Material:
-    """A material from SI numbers that a data sheet or a hand test gives: an isotropic sheet, unless `shear` says
-    otherwise.
+    """Build a material from SI values of a data sheet or a simple test. The sheet is isotropic, except for `shear` if
+    given.
 
     Args:
         density: [kg/m²].
-        stretching: force per width per strain at rest of a strip whose sides are free [N/m]; of a solid sheet E h.
-        bending: bending stiffness per width B [N·m] (ASTM D1388: density · g · (overhang / 2)³); of a solid sheet
+        stretching: force per width per strain of a strip with free sides [N/m]. For a solid sheet this is E h.
+        bending: bending stiffness per width B [N·m] (ASTM D1388: density · g · (overhang / 2)³). For a solid sheet this is
             E h³/12.
-        poisson: contraction across for each part it is stretched along, in [0, 1); the tables hold no negative one.
+        poisson: Poisson's ratio ν in [0, 1).
         shear: shear force per width per shear angle [N/m]; default that of an isotropic sheet, stretching / (2 (1 + ν)).
-            The table's k3 is twice that, since its energy is k3 E01² per area, and the shear angle 2 E01.
+            The table's k3 is twice this value: its energy is k3 E01² per area, and the shear angle is 2 E01.
         stiffening: factor on the stretching coefficients at the reference strain of the tables.
         damping: [s].
 
     Raises:
-        SceneError: a Poisson's ratio beyond its limits, or what `Material` refuses.
+        SceneError: Poisson's ratio is outside [0, 1), or `Material` rejects a value.
     """
     if not 0 <= poisson < 1:
         raise SceneError(f"Material {name!r}: Poisson's ratio is at least 0 and below 1 here, got {poisson}.")
@@ -186,8 +186,8 @@ _KES_SOURCE = (
 )
 
 FABRIC_DAMPING = 0.005
-"""[s] Chosen, not measured. An elastic vibration of 2 Hz loses a fifth of its amplitude in each period, and one at the size
-of the mesh is gone within a few milliseconds; without damping those last, and no step is short enough for them."""
+"""Default damping of fabrics [s]: chosen, not measured. An elastic vibration of 2 Hz loses a fifth of its amplitude in each
+period. Vibrations at the scale of the mesh decay within milliseconds; without damping, no time step would resolve them."""
 
 _PRESETS = {
     material.name: material
@@ -265,7 +265,7 @@ def presets() -> tuple[str, ...]:
 
 
 def preset(name: str) -> Material:
-    """A built-in material by name.
+    """Return a built-in material by name.
 
     Raises:
         ConfigError: no such preset; the message lists them.
@@ -276,10 +276,10 @@ def preset(name: str) -> Material:
 
 
 def read_material(path: Path) -> Material:
-    """Read an ARCSim material file: density, stretching 6 x 4, bending 3 x 5.
+    """Read an ARCSim material file: density, stretching [6, 4], bending [3, 5].
 
     Raises:
-        SceneError: the file is missing, lacks a field, has one too many, or a table of the wrong shape.
+        SceneError: the file is missing, has a missing or unknown field, or a table of the wrong shape.
     """
     data = read_json(path, error=SceneError, comments=True)
     expected = {"density", "stretching", "bending"}

@@ -15,17 +15,18 @@ _IDENTITY_QUATERNION = (1.0, 0.0, 0.0, 0.0)
 
 @dataclass(frozen=True)
 class Keyframe:
-    """A transform x -> translation + scale · R x at a time, with an optional velocity of its eight numbers."""
+    """A transform x -> translation + scale · R x at a time, with an optional time derivative."""
 
     time: float
-    """[s]"""
+    """Time of the keyframe [s]."""
     translation: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """[m]"""
+    """Translation [m]."""
     scale: float = 1.0
     quaternion: tuple[float, float, float, float] = _IDENTITY_QUATERNION
-    """(w, x, y, z)"""
+    """Rotation as a quaternion (w, x, y, z)."""
     velocity: tuple[float, ...] | None = None
-    """Time derivative of (translation, scale, quaternion) [8]; None: central difference inside, zero at the ends."""
+    """[8] time derivative of (translation, scale, quaternion). None: central difference, zero at the first and last
+    keyframe."""
 
 
 @dataclass(frozen=True)
@@ -33,7 +34,7 @@ class Motion:
     """A spline through keyframes, constant before the first and after the last.
 
     Raises:
-        SceneError: no keyframes, or times that do not increase.
+        SceneError: there are no keyframes, or their times do not increase.
     """
 
     keyframes: tuple[Keyframe, ...]
@@ -44,7 +45,7 @@ class Motion:
             raise SceneError(f"A motion needs keyframes at increasing times, got times {times}.")
 
     def at(self, times: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Transforms at times [S]: linear part scale · R [S, 3, 3] and translation [S, 3] [m]."""
+        """Transforms at times [S] [s]: linear part scale · R [S, 3, 3] and translation [S, 3] [m]."""
         key_times = np.array([key.time for key in self.keyframes])
         values = np.array([[*key.translation, key.scale, *key.quaternion] for key in self.keyframes])
         if len(values) == 1:
@@ -71,10 +72,10 @@ class Motion:
 
 
 def axis_angle_quaternion(degrees: float, axis: tuple[float, float, float]) -> tuple[float, float, float, float]:
-    """Unit quaternion (w, x, y, z) of a rotation about an axis; a zero angle gives the identity, whatever the axis.
+    """Unit quaternion (w, x, y, z) of a rotation about an axis. A zero angle gives the identity for any axis.
 
     Raises:
-        SceneError: a rotation about no axis.
+        SceneError: the axis is zero.
     """
     if degrees == 0:
         return _IDENTITY_QUATERNION
@@ -87,7 +88,7 @@ def axis_angle_quaternion(degrees: float, axis: tuple[float, float, float]) -> t
 
 
 def _rotation(quaternion: NDArray[np.float64]) -> NDArray[np.float64]:
-    """[S, 4] -> [S, 3, 3], normalised first."""
+    """Rotation matrices [S, 3, 3] of quaternions [S, 4], which are normalised first."""
     w, x, y, z = (quaternion / np.linalg.norm(quaternion, axis=1, keepdims=True)).T
     rows = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],

@@ -1,4 +1,4 @@
-"""Where obstacles that move are in the course of a rollout, to be drawn or written."""
+"""Positions of moving obstacles and rigid bodies during a rollout, for rendering and export."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from diffcloud.sim.system import System
 
 
 def moved_surfaces(system: System, run: Rollout) -> tuple[FloatArray, IntArray]:
-    """Moving obstacles and then rigid bodies, as one mesh.
+    """Surface of all moving obstacles, followed by all rigid bodies, as one mesh.
 
     Returns:
-        Nodes [B, S + 1, P, 3] in the world's axes [m] and faces [F, 3]. Without any, P and F are zero; where a batch entry
+        Nodes [B, S + 1, P, 3] in the world frame [m] and faces [F, 3]. P and F are zero if there are none. If a batch entry
         diverged, its bodies are NaN.
     """
     around, batch, times = system.setup.surrounding, len(run.positions), run.times.numpy()

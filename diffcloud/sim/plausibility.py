@@ -1,21 +1,22 @@
-"""Whether a motion is physically possible: an unstable simulation does not always end in NaN or infinity.
+"""Plausibility check of a motion: an unstable simulation does not always end in NaN or infinity.
 
-What moves a held cloth is its weight, its handles, the wind, and what other forces say that they push with. With the
-mass M, the size l, the distance s that the handles have moved and their greatest speed v (the wind's, where that is
-greater), the weight G = M |g| with those pushes, the kinetic and elastic energies E and U (E₀ and U₀ at the start), and
-the work P of gravity since the start, a possible motion satisfies
+Energy enters the cloth through its weight, its handles, the wind, and the pushes that other force terms declare. A possible
+motion satisfies
 
     E ≤ 3 (K + W) + P,      K = E₀ + G (l + s) + ½ M v²,
 
-where W is the largest elastic energy that was stored at any earlier step, and 3 is a factor of safety: K is a rule of thumb
-for what handles and wind can do. Where a node is farther than three times the cloth's size from every place where a handle
-is in the course of the motion, the available energy must explain how far the cloth has stretched:
+with the kinetic energy E (E₀ at the start), the largest elastic energy W at any earlier step, and the work P of gravity
+since the start. G is the weight M |g| of the mass M plus those pushes, l the cloth's size, and s the distance that the
+handles have moved. v is their greatest speed, or the wind's if greater. K is a rule of thumb, so 3 is a safety factor.
+
+If a node is farther than three times the cloth's size from every handle position of the motion, this energy must also be
+sufficient for the stretch. With the elastic energy U (U₀ at the start):
 
     E + U ≤ 3 (K + U₀) + P.
 
-Moving obstacles and rigid bodies count like handles of twice their speed, with which cloth can bounce off them. Once no
-handle holds the cloth at all, its nodes may also have fallen freely since then, but they are not stretched: what is
-farther is not possible.
+Moving obstacles and rigid bodies count as handles of twice their speed, since cloth can bounce off them. After the last
+handle releases the cloth, nodes may also move away by free fall. They are not stretched, so any greater distance is
+implausible.
 """
 
 from __future__ import annotations
@@ -33,46 +34,47 @@ _SIZES = 3.0
 _ENERGIES = 3.0
 _BOUNCE = 2.0
 _ROUNDING = 8 * float(np.finfo(np.float64).eps)
-"""Of positions, relative: without weight and handles nothing else explains the last digits of a cloth at rest."""
+"""Relative rounding error of positions. Without weight and handles, only rounding moves a cloth at rest."""
 
 
 @dataclass(frozen=True)
 class Motion:
-    """One cloth over S steps, and what moves it. In the scene's units."""
+    """One cloth over S steps, and what moves it. Values are in the scene's units."""
 
     positions: Floats
-    """[S + 1, V, 3]"""
+    """[S + 1, V, 3] node positions."""
     time_step: float
     mass: Floats
-    """[V]"""
+    """[V] node masses."""
     size: float
-    """Of the cloth: `ClothMesh.size`."""
+    """Size of the cloth (`ClothMesh.size`)."""
     places: Floats
-    """[S + 1, H, 3] where the handles are, at the start and after each step."""
+    """[S + 1, H, 3] handle positions at the start and after each step."""
     held: NDArray[np.bool_]
-    """[S, H] which of them hold in each step."""
+    """[S, H] True if a handle holds its node in a step."""
     gravity: Floats
-    """[3]"""
+    """[3] gravitational acceleration."""
     wind: float
-    """Speed of the air."""
+    """Wind speed."""
     velocities: Floats
-    """[V, 3] at the start."""
+    """[V, 3] velocities at the start."""
     others: Floats
     """[S + 1, P, 3] points of moving obstacles and rigid bodies."""
     push: float
-    """[N] of further forces that bring energy in, in whatever direction."""
+    """Magnitude of other forces that can add energy [N]."""
 
     @property
     def pull(self) -> float:
-        """[N] the weight, and what may push as it pulls."""
+        """Weight plus `push` [N]."""
         return float(self.mass.sum()) * float(np.linalg.norm(self.gravity)) + self.push
 
 
 def implausible(motion: Motion, stored: Callable[[int], float]) -> tuple[int, str] | None:
-    """The first step (from 1) after which the motion is not plausible, and why; None if it is.
+    """Return the first step (from 1) after which the motion is implausible, and the reason; None if it is plausible.
 
     Args:
-        stored: elastic energy after so many steps; asked only where the other terms do not explain the motion.
+        stored: function that returns the elastic energy after a number of steps. It is called only if the other terms
+            cannot account for the motion.
     """
     fallen = _fallen(motion)
     given, work, kinetic = _energies(motion, fallen)
@@ -81,12 +83,7 @@ def implausible(motion: Motion, stored: Callable[[int], float]) -> tuple[int, st
 
 
 def _energies(motion: Motion, fallen: Floats) -> tuple[Floats, Floats, Floats]:
-    """[S] each, after every step: what can have come into the cloth but for its weight (K), what that did (P), and the
-    kinetic energy (E).
-
-    Args:
-        fallen: [S] as of `_fallen`.
-    """
+    """K, P and E of the module's docstring after every step, each [S]; `fallen` [S] is the result of `_fallen`."""
     step, mass = motion.time_step, float(motion.mass.sum())
     velocities = np.diff(motion.positions, axis=0) / step
     kinetic = 0.5 * np.einsum("svi,svi,v->s", velocities, velocities, motion.mass)
@@ -104,18 +101,19 @@ def _energies(motion: Motion, fallen: Floats) -> tuple[Floats, Floats, Floats]:
 def _too_far(
     motion: Motion, fallen: Floats, given: Floats, spent: Floats, stored: Callable[[int], float]
 ) -> tuple[int, str] | None:
-    """Args: fallen, given, spent: [S] as of `_fallen`, K, and P - E."""
+    """Step and reason of the first node that is too far from all handles, or None. `fallen` [S] is the result of `_fallen`,
+    `given` and `spent` [S] are K and P - E of the module's docstring."""
     places = np.concatenate([motion.places[1:][motion.held], motion.others.reshape(-1, 3)])
     if not len(places):
         places = motion.positions[0]
     allowed = _SIZES * motion.size + fallen
     offsets = motion.positions[1:] - places[0]
-    if (np.abs(offsets).max(axis=(1, 2)) * np.sqrt(3) <= allowed).all():  # the common case, at little cost
+    if (np.abs(offsets).max(axis=(1, 2)) * np.sqrt(3) <= allowed).all():  # the common case, cheap
         return None
     distance, _ = cKDTree(places).query(motion.positions[1:])
     worst = distance.max(axis=1)
     for step in np.flatnonzero(worst > allowed):
-        stretched = motion.held[step].any() or motion.others.shape[1] > 0  # what nothing holds has no weight to bear
+        stretched = motion.held[step].any() or motion.others.shape[1] > 0  # a free cloth is not stretched by its weight
         if not stretched or stored(int(step) + 1) > _ENERGIES * (given[step] + stored(0)) + spent[step]:
             return int(step) + 1, (
                 f"a node is {worst[step]:.3g} from everything that held the cloth, whose size is {motion.size:.3g} "
@@ -125,7 +123,7 @@ def _too_far(
 
 
 def _fallen(motion: Motion) -> Floats:
-    """[S] how far a node can have fallen since nothing held the cloth."""
+    """[S] the largest distance that a node can have fallen since the last handle released the cloth."""
     count = len(motion.positions) - 1
     holding = motion.held.any(axis=1)
     last = np.maximum.accumulate(np.where(holding, np.arange(1, count + 1), 0))
@@ -138,7 +136,7 @@ def _fallen(motion: Motion) -> Floats:
 def _too_quick(given: Floats, work: Floats, kinetic: Floats, stored: Callable[[int], float]) -> tuple[int, str] | None:
     most = 0.0
     known = 0
-    for after in np.flatnonzero(kinetic > _ENERGIES * given + work):  # none, where the motion is plausible
+    for after in np.flatnonzero(kinetic > _ENERGIES * given + work):  # empty if the motion is plausible
         while known <= after:
             most = max(most, stored(known))
             known += 1

@@ -1,7 +1,7 @@
-"""Physical quantities of a batch of simulations, and the named parameters that move them.
+"""Physical quantities of a batch of simulations, and the named parameters that scale them.
 
-A *property* is a tensor the physics reads, such as the mass of each node. A *parameter* is a number a person fits, such
-as the mass multiplier. This module is the only place that maps one to the other.
+A *property* is a tensor that the physics reads, such as the mass of each node. A *parameter* is a number that a person
+fits, such as the density multiplier. Only this module maps parameters to properties.
 """
 
 from __future__ import annotations
@@ -19,77 +19,77 @@ from diffcloud.errors import ConfigError, unknown_name
 
 @dataclass(frozen=True)
 class Properties:
-    """Physical quantities with a leading batch axis [B, ...]; every one is differentiable."""
+    """Physical quantities with a leading batch axis [B, ...]. All are differentiable."""
 
     node_mass: Tensor
-    """[B, V] of the cloth and of the air that moves with it: what a force has to accelerate [kg]."""
+    """[B, V] inertial mass: the cloth and the air that moves with it [kg]."""
     weight: Tensor
-    """[B, V] of the cloth alone: what gravity pulls at [kg]."""
+    """[B, V] mass on which gravity acts: the cloth only [kg]."""
     stretching: Tensor
     """[B, F] multiplier on the stretching table of each face [-]."""
     shear: Tensor
-    """[B] multiplier on the shear stiffness of the stretching table, beside `stretching` [-]."""
+    """[B] multiplier on the shear column of the stretching table, in addition to `stretching` [-]."""
     compression: Tensor
-    """[B] part of the stretching stiffness that resists compression [-]; without effect in a material that resists in
-    full."""
+    """[B] fraction of the stretching stiffness that resists compression [-]. Has no effect if the material's is 1."""
     bending: Tensor
     """[B, H] multiplier on the bending table of each hinge [-]."""
     damping: Tensor
     """[B] stiffness-proportional damping [s]."""
     air_density: Tensor
-    """[B] of the quadratic normal drag [kg/m³]."""
+    """[B] air density for the quadratic normal drag [kg/m³]."""
     air_drag: Tensor
-    """[B] of the linear tangential drag [kg/(m²·s)]."""
+    """[B] coefficient of the linear tangential drag [kg/(m²·s)]."""
     linear_drag: Tensor
-    """[B] of the linear drag in all directions [kg/(m²·s)]."""
+    """[B] coefficient of the linear drag in all directions [kg/(m²·s)]."""
     friction: Tensor
     """[B] Coulomb coefficient between cloth and obstacles [-]."""
     self_friction: Tensor
-    """[B] Coulomb coefficient between cloths [-]."""
+    """[B] Coulomb coefficient of the cloth with itself [-]."""
     body_mass: Tensor
-    """[B, N] of the rigid bodies [kg]; their inertia scales with it."""
+    """[B, N] mass of the rigid bodies [kg]. Their inertia scales with it."""
 
     @property
     def batch(self) -> int:
         return len(self.damping)
 
     def tensors(self) -> tuple[Tensor, ...]:
-        """The fields in order."""
+        """Return all fields in the order of their definition."""
         return tuple(getattr(self, field.name) for field in fields(self))
 
     def repeated(self, count: int) -> Properties:
-        """The whole batch `count` times over, copies outermost: [count · B, ...]."""
+        """Repeat the whole batch `count` times: [count · B, ...], copies outermost."""
         return Properties(*(tensor.repeat(count, *[1] * (tensor.dim() - 1)) for tensor in self.tensors()))
 
 
 Quantity = Literal["stretching", "shear", "bending", "density", "air_density", "added_mass", "linear_drag", "body_mass"]
-"""What of the nominal material, the air and the bodies a multiplier acts on."""
+"""Quantity of the material, the air or the bodies that a multiplier scales."""
 
 
 @dataclass(frozen=True)
 class Parameter:
-    """What a named parameter is and how a person reads it."""
+    """Meaning, unit and bounds of a named parameter."""
 
     name: str
     meaning: str
     unit: str
-    """SI, of what people state and read. A multiplier times the nominal value of its `quantity` has it."""
+    """SI unit that users read and write. A multiplier times the nominal value of its `quantity` is in this unit."""
     bounds: tuple[float, float]
-    """Of a fit, unless others are given: multiples of the scene's own material where there is a `quantity`."""
+    """Default bounds of a fit. If the parameter has a `quantity`, they are multiples of the scene's nominal value."""
     quantity: Quantity | None = None
-    """What the simulator's multiplier acts on; None: the simulator takes the value itself."""
+    """Quantity that the simulator multiplies. None: the simulator takes the value itself."""
     most: float = math.inf
-    """Largest value that means something."""
+    """Largest physically meaningful value."""
 
     def check(self, value: float, what: str, nominal: float = 1.0) -> None:
-        """
+        """Raise an error if the parameter cannot have a value.
+
         Args:
             value: in `unit`, or a multiplier.
-            what: names the value in the message, such as "--set stretching".
-            nominal: the value that a multiplier of 1 stands for; 1 of a multiplier.
+            what: name of the value in the message, such as "--set stretching".
+            nominal: nominal value in `unit`; 1 if `value` is a multiplier.
 
         Raises:
-            ConfigError: not a number that this parameter can have.
+            ConfigError: the parameter cannot have this value.
         """
         low, high = (bound * nominal for bound in self.bounds)
         if not math.isfinite(value):
@@ -108,7 +108,7 @@ class Parameter:
 
 
 _LARGEST = 1e6
-"""Of a multiplier; its inverse is the least one. Beyond, arithmetic loses what is added."""
+"""Largest multiplier; its inverse is the smallest. Beyond it, sums lose the smaller terms to rounding."""
 _MULTIPLIED = (0.1, 10.0)
 PARAMETERS: dict[str, Parameter] = {
     parameter.name: parameter
@@ -127,17 +127,18 @@ PARAMETERS: dict[str, Parameter] = {
         Parameter("body_mass", "mass of all rigid bodies", "kg", _MULTIPLIED, "body_mass"),
     )
 }
-"""Every parameter by name: the one table that bounds, units, checks, records and docs/concepts.md are made from. The paper
-fits stretching and density in [0.1, 10]."""
+"""Every parameter by name. Bounds, units, checks, records and docs/concepts.md are made from this table. The paper fits
+stretching and density in [0.1, 10]."""
 
 
 def check_values(values: Mapping[str, float], option: str) -> None:
-    """
+    """Check values of parameters by name.
+
     Args:
-        option: what the values were given by, for messages.
+        option: option that gave the values, for messages.
 
     Raises:
-        ConfigError: an unknown parameter, or a value that it cannot have.
+        ConfigError: a parameter is unknown, or cannot have its value.
     """
     for name, value in values.items():
         if name not in PARAMETERS:
@@ -146,7 +147,7 @@ def check_values(values: Mapping[str, float], option: str) -> None:
 
 
 def one_set(values: Mapping[str, float]) -> dict[str, Tensor]:
-    """Values of one parameter set as a batch takes them: name -> [1]."""
+    """Convert the values of one parameter set to a batch of one: name -> [1]."""
     return {name: torch.tensor([value], dtype=torch.float64) for name, value in values.items()}
 
 
@@ -157,17 +158,17 @@ def scaled_properties(
     faces: Tensor,
     node_sets: Mapping[str, Tensor] | None = None,
 ) -> Properties:
-    """Properties of a batch of parameter sets.
+    """Apply a batch of parameter sets to the nominal properties.
 
     Args:
         base: the nominal material, batch 1.
-        values: name -> [B] values (multipliers or absolute, see `PARAMETERS`); all of one length.
-        faces: [F, 3] node indices, to spread a node set's multiplier over faces.
-        node_sets: parameter name -> bool [V]; `density` and `stretching` act on those nodes only (the published experiments
-            multiply the mass of a part of the nodes). A face takes the mean multiplier of its corners.
+        values: name -> [B] multipliers or absolute values, see `PARAMETERS`.
+        faces: [F, 3] node indices, to average a node set's multiplier over each face.
+        node_sets: parameter name -> bool [V]. `density` and `stretching` then act on those nodes only, as in the published
+            experiments. A face takes the mean multiplier of its corners.
 
     Raises:
-        ConfigError: an unknown parameter, a node set for a parameter that takes none, or values of different lengths.
+        ConfigError: a parameter is unknown, does not support node sets, or the values have different lengths.
     """
     node_sets = node_sets or {}
     for name in values:

@@ -1,4 +1,4 @@
-"""Obstacles that nothing can push: static ones, and those that follow a motion."""
+"""Obstacles that contact forces do not move: static ones, and those that follow a given motion."""
 
 from __future__ import annotations
 
@@ -15,28 +15,28 @@ from diffcloud.sim.motion import Motion
 
 @dataclass(frozen=True)
 class MovingObstacle:
-    """An obstacle that follows keyframes, whatever it meets."""
+    """An obstacle that follows keyframes, regardless of contact."""
 
     mesh: SurfaceMesh
-    """At the motion's identity [m]."""
+    """Mesh before the motion is applied [m]."""
     motion: Motion
     start: float = 0.0
-    """Before it, the motion stands as at this time [s]."""
+    """The obstacle does not move before this time [s]."""
     end: float = float("inf")
-    """After it, the motion stands as at this time [s]."""
+    """The obstacle does not move after this time [s]."""
 
     def at(self, times: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Points [T, P, 3] [m] at times [T] [s]."""
+        """Nodes [T, P, 3] [m] at times [T] [s]."""
         linear, translation = self.motion.at(np.clip(times, self.start, self.end))
         return np.asarray(np.einsum("tij,oj->toi", linear, self.mesh.nodes) + translation[:, None])
 
 
 @dataclass(frozen=True)
 class Scenery:
-    """The points of all static and all moving obstacles, in this order."""
+    """The points of all static obstacles, followed by those of all moving ones."""
 
     fixed: NDArray[np.float64]
-    """[O, 3] [m]; of the moving ones, before their motion."""
+    """[O, 3] points [m]; moving obstacles are here without their motion."""
     moving: tuple[tuple[slice, MovingObstacle], ...] = ()
 
     @staticmethod
@@ -50,7 +50,7 @@ class Scenery:
         )
 
     def at(self, times: NDArray[np.float64]) -> NDArray[np.float64]:
-        """[T, O, 3] at times [T] [s]."""
+        """Points [T, O, 3] [m] at times [T] [s]."""
         points = np.broadcast_to(self.fixed, (len(times), *self.fixed.shape)).copy()
         for place, obstacle in self.moving:
             points[:, place] = obstacle.at(times)

@@ -1,6 +1,7 @@
-"""The simulation: init, rollout, and derivatives of rollouts.
+"""The simulation: initial state, rollout, and derivatives of rollouts.
 
-Kernels simulate one cloth at a time; here they are given batches, over threads, as one differentiable operation of torch.
+Kernels simulate one cloth at a time. This module runs them on batches, in several threads, as one differentiable torch
+operation.
 """
 
 from __future__ import annotations
@@ -21,21 +22,21 @@ from diffcloud.sim.system import State, System
 
 @dataclass(frozen=True)
 class Rollout:
-    """A batch of trajectories."""
+    """Simulated trajectories of a batch of cloths."""
 
     positions: Tensor
-    """[B, S + 1, V, 3] after 0, 1, ... S steps [m]."""
+    """[B, S + 1, V, 3] node positions at the start and after each of S steps [m]."""
     times: Tensor
-    """[S + 1] [s]"""
+    """[S + 1] times of these states [s]."""
     velocities: Tensor
-    """[B, S + 1, V, 3] [m/s]"""
+    """[B, S + 1, V, 3] node velocities [m/s]."""
     bodies: BodyState | None = None
-    """Of rigid bodies, its fields stacked [B, S + 1, N, ...]."""
+    """Rigid bodies, with fields stacked as [B, S + 1, N, ...]; None without bodies."""
     diverged: Mapping[int, DivergedError] = field(default_factory=dict)
-    """Batch entries that diverged, if `rollout` was to drop them: from that step on their positions are NaN."""
+    """Batch entries that diverged, with `drop_diverged`. Their positions are NaN from this step on."""
 
     def at(self, times: Tensor) -> Tensor:
-        """[B, T, V, 3] positions at times [T], linear between steps."""
+        """Positions [B, T, V, 3] [m] at times [T] [s], interpolated linearly between steps."""
         place = (times / self.times[1]).clamp(0, len(self.times) - 1)
         nearest = place.round()
         place = torch.where((place - nearest).abs() < 1e-6, nearest, place)
@@ -45,11 +46,12 @@ class Rollout:
 
 
 def init(system: System, batch: int = 1, *, positions: Tensor | None = None, velocities: Tensor | None = None) -> State:
-    """The state at time zero.
+    """State at time zero.
 
     Args:
         batch: B, the number of parameter sets.
-        positions, velocities: [B or 1, V, 3] instead of the mesh's own positions and rest.
+        positions: [B or 1, V, 3]; default the nodes of the mesh [m].
+        velocities: [B or 1, V, 3]; default zero [m/s].
     """
     if positions is None:
         positions = torch.as_tensor(system.mesh.nodes, dtype=torch.float64)[None]
@@ -62,7 +64,7 @@ def init(system: System, batch: int = 1, *, positions: Tensor | None = None, vel
 
 
 def still(system: System, positions: Tensor) -> State:
-    """A direction of the state at time zero, in which nothing but the cloth's positions [B, V, 3] changes."""
+    """Direction (tangent) of the initial state in which only the cloth's positions [B, V, 3] change."""
     start = init(system, len(positions))
     bodies = None if start.bodies is None else BodyState(*(torch.zeros_like(part) for part in start.bodies.tensors()))
     return State(positions, torch.zeros_like(positions), bodies)
@@ -78,20 +80,19 @@ def rollout(
     drop_diverged: bool = False,
     progress: Callable[[int], None] | None = None,
 ) -> Rollout:
-    """Simulate `steps` steps, on the CPU in double precision. Differentiable in reverse mode in all tensors that it
-    is given.
+    """Simulate `steps` steps on the CPU in double precision. Reverse-mode differentiable in all input tensors.
 
     Args:
         properties: of a batch of parameter sets; default the nominal material, batch 1.
-        state: where to begin; default rest.
-        track: [B or 1, S, G, 3] displacement of each gripper since the start at the end of each step [m], in the order of
-            `Handles.grippers`; then the moving handles follow them instead of the scene's own motion.
-        drop_diverged: go on without batch entries that diverge, and name them in `Rollout.diverged`.
-        progress: called now and then with the number of finished steps, of the whole batch on average.
+        state: initial state; default at rest.
+        track: [B or 1, S, G, 3] displacement of each gripper since the start, at the end of each step [m]. The order is
+            that of `Handles.grippers`. The track replaces the scene's own motion of the moving handles.
+        drop_diverged: report batch entries that diverge in `Rollout.diverged` instead of raising an error.
+        progress: called from time to time with the number of finished steps, averaged over the batch.
 
     Raises:
         DivergedError: names the batch entries that diverged, and the first step in which one did.
-        SceneError: a track of other grippers than the scene's or of fewer steps, or an input of another shape.
+        SceneError: an input has the wrong shape, or the track has other grippers or fewer steps.
     """
     properties = system.properties if properties is None else properties
     state = init(system, properties.batch) if state is None else state
@@ -118,16 +119,18 @@ def rollout_tangents(
     track: Tensor | None = None,
     track_tangents: Tensor | None = None,
 ) -> tuple[Rollout, Tensor]:
-    """A rollout and its derivative along K directions, carried along with it.
+    """Simulate a batch, with its derivatives along K directions (forward mode).
 
     Args:
         properties: [B, ...].
         tangents: [K · B, ...] directions of the properties, directions outermost.
-        state, state_tangents: start, and directions of it, each field [K · B, ...].
-        track, track_tangents: displacement of the grippers [B or 1, S, G, 3] and its directions [K · B, S, G, 3].
+        state: initial state.
+        state_tangents: directions of the initial state, each field [K · B, ...].
+        track: [B or 1, S, G, 3] displacement of the grippers [m].
+        track_tangents: [K · B, S, G, 3] directions of the track.
 
     Returns:
-        The rollout of the batch B, and d positions [K, B, S + 1, V, 3].
+        The rollout of the batch, and the derivatives of its positions [K, B, S + 1, V, 3].
 
     Raises:
         DivergedError: as `rollout`.
@@ -156,7 +159,7 @@ def rollout_tangents(
 
 
 class _Episodes(torch.autograd.Function):
-    """Episodes of a batch; inputs as `Batch.simulate` takes them."""
+    """Differentiable simulation of a batch. Inputs are those of `Batch.simulate`."""
 
     @staticmethod
     def forward(ctx: Any, batch: Batch, *inputs: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -171,7 +174,7 @@ class _Episodes(torch.autograd.Function):
 
 
 def _inputs(system: System, steps: int, properties: Properties, state: State, track: Tensor | None) -> list[Tensor]:
-    """What `Batch.simulate` takes, each for the batch or for all of it."""
+    """Check the inputs of `Batch.simulate` and convert them to tensors with a leading axis B or 1."""
     positions, velocities, poses = _packed(state)
     if poses is None:
         poses = torch.from_numpy(system.bodies.start)[None]
@@ -188,13 +191,13 @@ def _inputs(system: System, steps: int, properties: Properties, state: State, tr
     expected |= {field.name: getattr(system.properties, field.name).shape[1:] for field in fields(properties)}
     given = [positions, velocities, poses, *properties.tensors()]
     for (name, shape), tensor in zip(expected.items(), given, strict=True):
-        if tuple(tensor.shape[1:]) != tuple(shape):  # kernels do not look where arrays end
+        if tuple(tensor.shape[1:]) != tuple(shape):  # kernels do not check array bounds
             raise SceneError(f"{name} has shape [batch, {', '.join(map(str, shape))}] here, got {list(tensor.shape)}.")
     return [positions, velocities, poses, track, *properties.tensors()]
 
 
 def _packed(state: State) -> tuple[Tensor, Tensor, Tensor | None]:
-    """Positions and velocities [B, V, 3] and poses of the bodies [B, N, 18]; None: not given."""
+    """Positions and velocities [B, V, 3] and poses of the bodies [B, N, 18]; poses are None if the state has no bodies."""
     parts = None if state.bodies is None else [part.flatten(2) for part in state.bodies.tensors()]
     return state.positions, state.velocities, None if parts is None else torch.cat(parts, dim=2)
 
@@ -204,7 +207,7 @@ def _expanded(tensor: Tensor, count: int) -> Tensor:
 
 
 def _body_state(poses: Tensor) -> BodyState | None:
-    """[B, S + 1, N, 18] -> the bodies' states; None: there are none."""
+    """Convert poses [B, S + 1, N, 18] to the states of the bodies; None without bodies."""
     if not poses.shape[2]:
         return None
     centre, orientation, velocity, angular_velocity = poses.split([3, 9, 3, 3], dim=-1)
@@ -212,7 +215,7 @@ def _body_state(poses: Tensor) -> BodyState | None:
 
 
 def _joined(diverged: Mapping[int, DivergedError]) -> DivergedError:
-    """One error of all entries that diverged."""
+    """One error for all entries that diverged."""
     first = min(diverged.values(), key=lambda error: error.step)
     if len(diverged) == 1:
         return first
@@ -220,7 +223,7 @@ def _joined(diverged: Mapping[int, DivergedError]) -> DivergedError:
 
 
 def _cut(tensor: Tensor, diverged: Mapping[int, DivergedError]) -> Tensor:
-    """[B, S + 1, ...] with NaN from the step on in which an entry diverged."""
+    """Replace an entry's states by NaN from the step on in which it diverged. The tensor is [B, S + 1, ...]."""
     last = torch.full((len(tensor),), tensor.shape[1], dtype=torch.long)
     last[list(diverged)] = torch.tensor([error.step for error in diverged.values()])
     gone = torch.arange(tensor.shape[1]) >= last[:, None]

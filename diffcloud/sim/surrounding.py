@@ -1,4 +1,4 @@
-"""What surrounds a cloth: gravity, air, obstacles, and how things touch."""
+"""The surroundings of a cloth: gravity, air, obstacles, and contact settings."""
 
 from __future__ import annotations
 
@@ -17,68 +17,69 @@ Order = Literal[1, 2]
 
 @dataclass(frozen=True)
 class ContactSettings:
-    """Numbers of the contact models."""
+    """Parameters of the contact models."""
 
     stiffness: float = 1e4
-    """k_c [N/m³]: times a node's area gives the contact stiffness (ARCSim's default is 1e9)."""
+    """k_c [N/m³]. Multiplied by a node's area, it gives the contact stiffness (ARCSim's default is 1e9)."""
     repulsion_thickness: float = 3e-3
-    """τ, and d̂ of smooth contact [m] (ARCSim's default is 1e-3)."""
+    """Distance at which contact forces begin: τ of ARCSim, d̂ of smooth contact [m] (ARCSim's default is 1e-3)."""
     projection_thickness: float = 3e-4
-    """Of the arcsim integrator [m]."""
+    """Distance to which the arcsim integrator projects nodes out of obstacles [m]."""
     sticking_speed: float = 1e-3
-    """v_s of smooth contact: what sticks creeps slower than this [m/s]."""
+    """v_s of smooth contact: cloth in static friction slides slower than this [m/s]."""
 
 
 @dataclass(frozen=True)
 class ReferenceContact:
-    """Choices in which the reference simulator differs from what one would write today.
-
-    The defaults are the correct variant; `as_published` has the reference's quirks.
-    """
+    """Options in which ARCSim differs from a correct implementation. The defaults are the correct variant. `as_published`
+    reproduces ARCSim."""
 
     smallest: float = 0.0
-    """[m⁴] Pairs whose |a × b|² (cross product of two edges) is below never touch."""
+    """Pairs of edges with |a × b|² below this never touch [m⁴]."""
     count_once: bool = True
-    """Whether a pair that is nearest for both its primitives repels once, not twice."""
+    """If a pair is the nearest one of both its primitives, apply its repulsion once instead of twice."""
     residue: float = 0.0
-    """Part of each impact correction that is left out; decides ties in the next step."""
+    """Fraction of each impact correction that is omitted. It decides ties in the next step."""
 
     @staticmethod
     def as_published() -> ReferenceContact:
-        """What the published trajectories were made with; derivatives stay exact, which the original's are not."""
+        """Options of the published trajectories. Derivatives remain exact, unlike those of the original code."""
         return ReferenceContact(_ARCSIM_SMALLEST, count_once=False, residue=1e-9)
 
 
 @dataclass(frozen=True)
 class Surrounding:
-    """Everything around the cloth."""
+    """Gravity, air, obstacles and contact around the cloth."""
 
     gravity: tuple[float, float, float] = (0.0, 0.0, -9.81)
-    """[m/s²]"""
+    """Gravitational acceleration [m/s²]."""
     wind: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Velocity of the air [m/s]."""
+    """Air velocity [m/s]."""
     air_density: float = 1.0
-    """[kg/m³]; ARCSim's default, real air has 1.2."""
+    """Density of the air [kg/m³]. The default is ARCSim's; real air has 1.2."""
     air_drag: float = 0.0
-    """Tangential drag [kg/(m²·s)]."""
+    """Coefficient of the linear tangential drag [kg/(m²·s)]."""
     added_mass: float = 0.0
-    """Of air that moves with the cloth, in all directions alike [kg/m²]: it has inertia, and no weight."""
+    """Mass per area of the air that moves with the cloth [kg/m²]. It has inertia in all directions, but no weight."""
     linear_drag: float = 0.0
-    """In all directions [kg/(m²·s)]."""
+    """Coefficient of the linear drag in all directions [kg/(m²·s)]."""
     lagged_air: bool = False
-    """Whether drag is that before the step, as in ARCSim, where light cloth in dense air explodes."""
+    """Use the drag at the start of the step, as ARCSim does. Light cloth in dense air is then unstable."""
     self_friction: float = 0.6
     friction: float = 0.3
     contact: ContactSettings = field(default_factory=ContactSettings)
     proximity: bool = True
-    """Of the arcsim integrator: whether planes, and other meshes, repel and rub (off: only projection and impacts)."""
+    """Contact forces and friction of the arcsim integrator at planes and other meshes. False: only projection and impacts.
+    """
     self_contact: bool = True
-    """Whether the cloth meets itself (implicit integrator); without, layers pass through each other in quicker steps."""
+    """Whether the implicit integrator detects contact of the cloth with itself. False: faster, but layers interpenetrate.
+    """
     obstacles: tuple[SurfaceMesh, ...] = ()
-    """Static ones."""
+    """Static obstacles."""
     moving: tuple[MovingObstacle, ...] = ()
     bodies: tuple[RigidBody, ...] = ()
     forces: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
-    """Settings of further forces: name of the term -> what its `build` reads."""
+    """Settings of further forces: name of the force term -> settings that its `build` reads."""
     reference_contact: ReferenceContact | None = None
-    """Contact with all meshes and of the cloth with itself by proximity and impact zones; None: with planes only."""
+    """Contact by proximity and impact zones, with all meshes and of the cloth with itself. None: contact with planes only.
+    """

@@ -1,4 +1,4 @@
-"""What is constant in a run (`System`), how it is built, and what changes with each step (`State`)."""
+"""Constant data of a simulation (`System`) and its state at one time (`State`)."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from diffcloud.sim.terms.term import Setup
 
 @dataclass(frozen=True)
 class System:
-    """Everything constant in a run."""
+    """All data that are constant in a simulation."""
 
     setup: Setup
     time_step: float
-    """[s]"""
+    """Length of a step [s]."""
     properties: Properties
-    """Of the nominal material, batch 1."""
+    """Properties of the nominal material, batch 1."""
 
     @property
     def bodies(self) -> Bodies:
@@ -40,13 +40,13 @@ class System:
 
     @property
     def obstacles(self) -> tuple[SurfaceMesh, ...]:
-        """Meshes: static, moving (before their motion), and rigid bodies (at the start)."""
+        """All obstacle meshes: static, moving (before their motion), and rigid bodies (at the start)."""
         around = self.setup.surrounding
         return (*around.obstacles, *(moving.mesh for moving in around.moving), *(body.mesh for body in around.bodies))
 
     @property
     def moving_points(self) -> int:
-        """Of the obstacles that follow a motion."""
+        """Number of points on moving obstacles."""
         return sum(len(moving.mesh.nodes) for moving in self.setup.surrounding.moving)
 
     @property
@@ -55,17 +55,17 @@ class System:
 
     @cached_property
     def scene(self) -> Any:
-        """What the kernels of the integrator are given."""
+        """Constant data for the kernels of the integrator."""
         return self.integrator.build(self.setup, self.time_step)
 
 
 @dataclass(frozen=True)
 class State:
-    """A batch of cloths at one time."""
+    """State of a batch of cloths at one time."""
 
     positions: Tensor
-    """[B, V, 3] [m]"""
+    """[B, V, 3] node positions [m]."""
     velocities: Tensor
-    """[B, V, 3] [m/s]"""
+    """[B, V, 3] node velocities [m/s]."""
     bodies: BodyState | None = None
-    """Of the rigid bodies; None: where they start."""
+    """States of the rigid bodies; None: their initial states."""

@@ -1,8 +1,8 @@
-"""How many threads simulate, and how they are waited for.
+"""The threads that simulate.
 
-One thread has one cloth at a time, so that results are the same for any number of threads and any batch. All simulations
-of a process share one pool: where several recordings are compared side by side, no more threads simulate than were asked
-for.
+Each thread simulates one cloth at a time, so results do not depend on the number of threads or on the batch size. All
+simulations of a process share one thread pool. So the number of threads stays the same if several recordings are simulated
+at once.
 """
 
 from __future__ import annotations
@@ -16,27 +16,27 @@ from typing import TypeVar
 from diffcloud.errors import ConfigError
 
 _LOOK = 0.1
-"""[s] between two looks at progress and Ctrl-C."""
+"""Interval between checks of progress and Ctrl-C [s]."""
 _chosen: list[int] = []
 _simulating: list[tuple[int, ThreadPoolExecutor]] = []
 _here = threading.local()
 
 
 def cores() -> int:
-    """That this process may use."""
+    """Number of CPU cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def thread_count() -> int:
-    """Threads that simulate: all cores, unless `use_threads` said otherwise."""
+    """Number of simulating threads: all cores, unless `use_threads` set it."""
     return _chosen[-1] if _chosen else cores()
 
 
 def use_threads(count: int | None) -> None:
-    """Simulate with so many threads from now on; None: all cores.
+    """Set the number of simulating threads; None: all cores.
 
     Raises:
-        ConfigError: less than one.
+        ConfigError: the count is less than one.
     """
     if count is not None and count < 1:
         raise ConfigError(f"--threads must be at least 1, got {count}.")
@@ -44,15 +44,15 @@ def use_threads(count: int | None) -> None:
 
 
 def run_all(jobs: Sequence[Callable[[], None]], *, look: Callable[[], None], stop: Callable[[], None]) -> None:
-    """Run jobs, which leave Python's lock alone while they work.
+    """Run jobs that release Python's global interpreter lock in the thread pool, and wait for them.
 
     Args:
-        look: called now and then meanwhile.
-        stop: called when something interrupts; lets jobs that simulate end soon. Those that sweep an episode for its
-            derivatives end with it.
+        look: called regularly while the jobs run.
+        stop: called at an interruption. It makes running simulations end early. Jobs that compute gradients run to their
+            end.
 
     Raises:
-        KeyboardInterrupt: Ctrl-C, in the main thread or, within `map_threads`, in the one that waits there.
+        KeyboardInterrupt: Ctrl-C in the main thread, or in the thread that waits in `map_threads`.
     """
     interrupted: threading.Event | None = getattr(_here, "interrupted", None)
 
@@ -69,9 +69,9 @@ Found = TypeVar("Found")
 
 
 def map_threads(function: Callable[[Given], Found], given: Iterable[Given]) -> list[Found]:
-    """The function's results, in order; torch's gradients are recorded where they are here. What it simulates ends soon
-    after Ctrl-C."""
-    import torch  # here: commands that only choose a number of threads start without it
+    """Apply a function to each item in threads, and return the results in order. The calling thread's setting for recording
+    torch gradients applies. Simulations inside the function end soon after Ctrl-C."""
+    import torch  # imported here, because commands that only set the number of threads do not need it
 
     items, recording = list(given), torch.is_grad_enabled()
     if min(len(items), thread_count()) < 2:
@@ -88,7 +88,7 @@ def map_threads(function: Callable[[Given], Found], given: Iterable[Given]) -> l
 
 
 def _pool() -> ThreadPoolExecutor:
-    """What simulates, with as many threads as are asked for now."""
+    """The thread pool for simulations, with the requested number of threads."""
     count = thread_count()
     if not _simulating or _simulating[-1][0] != count:
         _simulating[:] = [(count, ThreadPoolExecutor(count, thread_name_prefix="diffcloud"))]
@@ -96,8 +96,8 @@ def _pool() -> ThreadPoolExecutor:
 
 
 def _finish(futures: Sequence[Future[Found]], look: Callable[[], None], stop: Callable[[], None]) -> list[Found]:
-    """Wait for all, and give what they found; the first error in order is raised. Ctrl-C, or an error of `look`, stops
-    them, and is raised once they have ended."""
+    """Wait for all futures and return their results, or raise the first error in order. On Ctrl-C or an error of `look`,
+    stop the jobs, wait for them, and raise it again."""
     open_jobs = set(futures)
     try:
         while open_jobs:
@@ -112,4 +112,4 @@ def _finish(futures: Sequence[Future[Found]], look: Callable[[], None], stop: Ca
     return [future.result() for future in futures]
 
 
-os.register_at_fork(after_in_child=_simulating.clear)  # its threads do not live there
+os.register_at_fork(after_in_child=_simulating.clear)  # a forked process does not inherit the threads

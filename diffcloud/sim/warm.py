@@ -1,4 +1,4 @@
-"""Short episodes that call every kernel of the simulator, to compile them ahead (`diffcloud doctor --compile`)."""
+"""Short simulations that call every kernel, to compile them ahead of time (`diffcloud doctor --compile`)."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from diffcloud.sim.surrounding import Surrounding
 
 
 def implicit() -> None:
-    """Kernels of the implicit step."""
+    """Compile the kernels of the implicit integrator."""
     _episode("implicit")
 
 
 def arcsim() -> None:
-    """Kernels of ARCSim's step."""
+    """Compile the kernels of the arcsim integrator."""
     _episode("arcsim")
 
 

@@ -1,5 +1,5 @@
-"""Contact as ARCSim has it, with its quirks where a scene asks for them.
+"""Contact as in ARCSim, including its peculiarities if a scene requests them.
 
-Repulsion with lagged friction acts inside the linearised step (`planes`, `proximity`); then come impact zones. Scenes
-choose by `Surrounding.reference_contact`.
+Repulsion with lagged friction acts in the linearised step (`planes`, `proximity`). Impact zones follow. Scenes select the
+options by `Surrounding.reference_contact`.
 """

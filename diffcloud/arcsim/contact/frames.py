@@ -1,12 +1,12 @@
-"""Normal and weights where two primitives meet, as ARCSim has them: projected along the common normal, not clamped.
+"""Normal and weights at the contact of two primitives, as in ARCSim: projected along the common normal, not clamped.
 
-Both kinds of pair obey one formula. With two edge vectors a, b and an offset d,
+Both kinds of pair use one formula. With two edge vectors a, b and an offset d,
 
     point and face    a = y1 - y0,  b = y2 - y0,  d = x - y0
     two edges         a = p1 - p0,  b = q1 - q0,  d = q0 - p0
 
-the normal is c/|c| with c = a × b, the places are α = (d × b)·c/|c|², β = (a × d)·c/|c|², and the four points are coplanar
-where c·d = 0.
+the normal is c/|c| with c = a × b. The positions along a and b are α = (d × b)·c/|c|² and β = (a × d)·c/|c|². The four
+points are coplanar if c·d = 0.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ _GRAZING = 1e-9
 
 
 def spans(kind: Kind, corners: Sequence[Vector]) -> tuple[Vector, Vector, Vector]:
-    """a, b, d of the four points."""
+    """Vectors a, b, d of the four points."""
     first, second, third, fourth = corners
     if kind == "point_face":
         return third - second, fourth - second, first - second
@@ -35,7 +35,7 @@ def spans(kind: Kind, corners: Sequence[Vector]) -> tuple[Vector, Vector, Vector
 
 
 def frame(kind: Kind, corners: Sequence[Vector]) -> tuple[list[Scalar], Vector]:
-    """(signed weights of the four points, sum zero; unit normal)."""
+    """Signed weights of the four points, whose sum is zero, and the unit normal."""
     a, b, d = spans(kind, corners)
     c = cross(a, b)
     square = maximum(dot(c, c), _TINY)
@@ -47,8 +47,8 @@ def frame(kind: Kind, corners: Sequence[Vector]) -> tuple[list[Scalar], Vector]:
 
 
 def _meeting(kind: Kind, inputs: Sequence[Scalar], constants: Sequence[Scalar]) -> list[Scalar]:
-    """Weights [4] and normal [3] where four points meet that go straight from start [4, 3] to end [4, 3], at a time that is
-    differentiable by the implicit function theorem."""
+    """Weights [4] and normal [3] at the time when four points moving straight from start to end, both [4, 3], are coplanar.
+    The time is differentiated by the implicit function theorem."""
     points = [Vector(*inputs[3 * k : 3 * k + 3]) for k in range(8)]
     start, end = points[:4], points[4:]
     time = constants[0]
@@ -57,7 +57,7 @@ def _meeting(kind: Kind, inputs: Sequence[Scalar], constants: Sequence[Scalar]) 
     da, db, dd = spans(kind, [last - first for first, last in zip(start, end, strict=True)])
     volume = dot(cross(a, b), d)
     rate = dot(cross(a, b), dd) + dot(cross(da, b) + cross(a, db), d)
-    # a grazing pair has no derivative of its time: call it constant
+    # The contact time of a grazing pair has no derivative, so it is treated as constant.
     sides = [absolute(second[axis] - first[axis]) for first, second in pairwise(at) for axis in range(3)]
     size = sides[0]
     for side in sides[1:]:
@@ -85,7 +85,7 @@ EDGE_EDGE_MEETING = Function("edge_edge_meeting", 24, 1, lambda inputs, constant
 
 @kernel
 def frame_at(edges: int, x: Floats, found: Floats) -> float:
-    """Weights and normal, found [7], of four points x [4, 3]; gives |c|² [m⁴]."""
+    """Compute weights and normal of four points x [4, 3] into `found` [7]. Return |c|² [m⁴]."""
     if edges > 0:
         a, b, d = _difference(x, 1, 0), _difference(x, 3, 2), _difference(x, 2, 0)
     else:
@@ -105,7 +105,7 @@ def frame_at(edges: int, x: Floats, found: Floats) -> float:
 
 @kernel
 def covers(edges: int, weights: Floats, tolerance: float) -> bool:
-    """Whether the places of weights [4] lie on both primitives."""
+    """Whether the contact point given by weights [4] is on both primitives."""
     if edges > 0:
         return (
             weights[0] >= -tolerance
@@ -118,7 +118,7 @@ def covers(edges: int, weights: Floats, tolerance: float) -> bool:
 
 @kernel
 def height(found: Floats, x: Floats) -> float:
-    """Of the first primitive over the second along the normal [m]: found [7] as of `frame_at`, x [4, 3]."""
+    """Height of the first primitive above the second along the normal [m], for `found` [7] from `frame_at` and x [4, 3]."""
     total = 0.0
     for k in range(4):
         total += found[k] * (found[4] * x[k, 0] + found[5] * x[k, 1] + found[6] * x[k, 2])

@@ -1,9 +1,9 @@
-"""Derivatives of the impact zones' passes (`impact_zones.resolve`).
+"""Derivatives of the passes of the impact zones (`impact_zones.resolve`).
 
-A pass moves the points of a zone to x = x̂ + c M⁻¹ Wᵀ λ, where the active rows obey (G + ε diag G) λ = h - W x̂ with
-G = W M⁻¹ Wᵀ. Which rows are active, and which zones a pass solves, has no derivative. A row's weights and normal come from
-the pass that found it: they belong to the time at which its four points meet on their way from the start of the step
-to where they were before that pass.
+A pass moves the points of a zone to x = x̂ + c M⁻¹ Wᵀ λ. The active rows satisfy (G + ε diag G) λ = h - W x̂, where
+G = W M⁻¹ Wᵀ. The choice of active rows and zones is not differentiated. Weights and normal of a row come from the pass
+that found it. They are those at the time when its four points meet, on straight paths from the start of the step to their
+positions before this pass.
 """
 
 from __future__ import annotations
@@ -35,20 +35,20 @@ def resolve_reverse(
     start_gradient: Floats,
     mass_gradient: Floats,
 ) -> None:
-    """Sweep the passes of one step backwards.
+    """Propagate gradients backwards through the passes of one step.
 
     Args:
-        begin, end: [5] rows of `Kept.begins` at the start of the step and of the next.
+        begin, end: [5] rows of `Kept.begins` for this step and the next one.
         start, candidate: [N, 3] points at the start of the step, and before its impacts [m].
-        inverse_mass: [N] of the impacts [1/kg].
-        places: [N, 3] gradient by the places after the impacts; takes that by the candidate.
-        start_gradient, mass_gradient: [N, 3], [N] take what is added for the start and the inverse masses.
+        inverse_mass: [N] as used for the impacts [1/kg].
+        places: [N, 3] gradient of the positions after the impacts; receives that of the candidate.
+        start_gradient, mass_gradient: [N, 3], [N] receive additions for the start and the inverse masses.
     """
     first, passes = begin[1], end[2] - begin[2]
     history = _replayed(choices, record, begin, passes, candidate, inverse_mass)
     known = end[1] - first
     row_gradient = np.zeros((known, 7))
-    before = np.zeros(places.shape)  # gradient by the candidate
+    before = np.zeros(places.shape)  # gradient of the candidate
     force_row = end[3]
     inputs, time, slopes, part = np.empty(24), np.empty(1), np.empty(24), np.empty(7)
     for p in range(passes - 1, -1, -1):
@@ -108,10 +108,10 @@ def resolve_tangent(
     mass_rates: Floats,
     places: Floats,
 ) -> None:
-    """Carry rates [K, N, 3] of the candidate through the passes of one step; `places` takes those after it.
+    """Propagate derivatives [K, N, 3] of the candidate, in `places`, through the passes of one step, in place.
 
     Args:
-        start_rates, mass_rates: [K, N, 3], [K, N] of the start and of the inverse masses. Others as above.
+        start_rates, mass_rates: [K, N, 3], [K, N] derivatives of the start and of the inverse masses. Others as above.
     """
     first, passes = begin[1], end[2] - begin[2]
     history = _replayed(choices, record, begin, passes, candidate, inverse_mass)
@@ -169,7 +169,7 @@ def resolve_tangent(
 def _replayed(
     choices: Projection, record: Impacts, begin: Ints, passes: int, candidate: Floats, inverse_mass: Floats
 ) -> Floats:
-    """[P + 1, N, 3] places before each pass, and after the last."""
+    """Positions [P + 1, N, 3] before each pass, and after the last one."""
     history = np.empty((passes + 1, len(candidate), 3))
     copy_to(history[0], candidate)
     first, force_row = begin[1], begin[3]
@@ -187,7 +187,7 @@ def _replayed(
 
 @kernel
 def _rows_of(record: Impacts, first: int, chosen: Ints, force_row: int):  # type: ignore[no-untyped-def]
-    """(points [m, 4], places [m, 9], λ [m]) of the rows of a zone."""
+    """Points [m, 4], places [m, 9] and λ [m] of the rows of a zone."""
     count = len(chosen)
     points, rows, force = np.empty((count, 4), np.int64), np.empty((count, 9)), np.empty(count)
     for m in range(count):
@@ -201,7 +201,7 @@ def _rows_of(record: Impacts, first: int, chosen: Ints, force_row: int):  # type
 
 @kernel
 def _meeting_inputs(record: Impacts, row: int, start: Floats, places: Floats, inputs: Floats) -> None:
-    """inputs [24]: where the four points of a row begin and end."""
+    """Write the start and end positions of a row's four points to `inputs` [24]."""
     for k in range(4):
         for axis in range(3):
             inputs[3 * k + axis] = start[record.met[row, 1 + k], axis]
@@ -210,7 +210,7 @@ def _meeting_inputs(record: Impacts, row: int, start: Floats, places: Floats, in
 
 @kernel
 def _factorised(points: Ints, rows: Floats, force: Floats, regular: float, inverse_mass: Floats):  # type: ignore[no-untyped-def]
-    """(factor, pivots, active rows) of G + ε diag G over the rows that push."""
+    """Factor, pivots and active rows of G + ε diag G, where the active rows are those with a positive force."""
     count = 0
     for m in range(len(force)):
         if force[m] > 0:
@@ -244,11 +244,11 @@ def _zone_reverse(
     before: Floats,
     mass_gradient: Floats,
 ) -> Floats:
-    """One zone of one pass: from the gradient by its points, which is taken away, to those by the candidate, the
-    inverse masses and the rows' weights and normals, [m, 7].
+    """Backward pass through one zone of one pass.
 
-    With q the gradient by the places, μ the adjoint of λ, z = Wᵀ λ, s = Wᵀ μ and Q = c q - s the sums over rows are
-    those of λ_j W_j M⁻¹ Q - μ_j W_j (x̂ + M⁻¹ z).
+    Moves the gradient of its points to those of the candidate and the inverse masses. Returns the gradient of the rows'
+    weights and normals [m, 7]. Let q be the gradient of the positions, μ the adjoint of λ, z = Wᵀ λ, s = Wᵀ μ, and
+    Q = c q - s. Then the sums over rows are those of λ_j W_j M⁻¹ Q - μ_j W_j (x̂ + M⁻¹ z).
     """
     matrix, pivots, active = _factorised(points, rows, force, regular, inverse_mass)
     adjoint = np.zeros(len(force))
@@ -281,7 +281,7 @@ def _zone_reverse(
     for m in range(len(force)):
         for k in range(4):
             i = points[m, k]
-            for axis in range(3):  # of each point once: then it is taken away
+            for axis in range(3):  # each point once, so its sums are cleared afterwards
                 before[i, axis] -= pulled[i, axis]
                 if inverse_mass[i] > 0:
                     mass_gradient[i] += (part * places[i, axis] - pulled[i, axis]) * pushed[i, axis]
@@ -306,9 +306,9 @@ def _zone_tangent(  # type: ignore[no-untyped-def]
     mass_rates: Floats,
     places: Floats,
 ) -> None:
-    """One zone of one pass and one direction: rates of its points after it."""
+    """Forward pass through one zone of one pass, along one direction: updates the derivatives of its points."""
     matrix, pivots, active = factor
-    pushed, change = np.zeros(candidate.shape), np.zeros(candidate.shape)  # z, and how it changes
+    pushed, change = np.zeros(candidate.shape), np.zeros(candidate.shape)  # z and its derivative
     for m in range(len(force)):
         rate = row_rates[chosen[m]]
         for k in range(4):

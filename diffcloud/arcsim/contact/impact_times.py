@@ -1,7 +1,7 @@
-"""Continuous detection: when and where linearly moving primitives first meet (Provot 1997; Bridson et al. 2002).
+"""Continuous collision detection: when and where linearly moving primitives first meet (Provot 1997; Bridson et al. 2002).
 
-Four points are coplanar where a cubic in the time vanishes; a static partner makes it quadratic or linear. The roots are
-bracketed between the cubic's critical points, where it is monotone, and found by Newton's method kept inside the bracket.
+Four points are coplanar at the roots of a cubic in time. With a static partner it is quadratic or linear. The roots are
+bracketed between the cubic's critical points, where it is monotone. Newton's method finds them within the bracket.
 """
 
 from __future__ import annotations
@@ -17,21 +17,21 @@ from diffcloud.sim.compiled.data import Floats
 _ITERATIONS = 80
 _TIME = 1e-15
 _COPLANAR = 1e-6
-"""[m] Distance at a root above which the root is an artefact of rounding."""
+"""Distance of the primitives above which a root is a rounding artefact [m]."""
 _OUTSIDE = 1e-6
-"""Weights this far outside of a primitive still count as on it."""
+"""Tolerance of the weights for points slightly outside a primitive."""
 NEVER = 2.0
-"""The time of an impact that does not happen."""
+"""Time that stands for no impact."""
 
 
 @kernel
 def first_impact(edges: int, start: Floats, end: Floats, smallest: float, place: Floats) -> float:
-    """The first time in [0, 1] at which a pair meets that goes straight from start to end [4, 3], else `NEVER`.
+    """First time in [0, 1] at which a pair meets that moves straight from start to end [4, 3], or `NEVER`.
 
     Args:
         edges: 1 for two edges, 0 for a point and a face.
-        smallest: [m⁴] pairs with |a × b|² below never meet.
-        place: [7] takes the weights and the normal of that time.
+        smallest: pairs with |a × b|² below this never meet [m⁴].
+        place: [7] receives the weights and the normal at this time.
     """
     cubic = coplanarity_cubic(edges, start, end)
     x = np.empty((4, 3))
@@ -50,7 +50,7 @@ def first_impact(edges: int, start: Floats, end: Floats, smallest: float, place:
 
 @kernel
 def coplanarity_cubic(edges: int, start: Floats, end: Floats) -> tuple[float, float, float, float]:
-    """Coefficients (constant first) over the time in [0, 1] of (a × b)·d, six times the volume of four points [m³]."""
+    """Coefficients, constant first, of (a × b)·d over the time in [0, 1]: six times the volume of the four points [m³]."""
     if edges > 0:
         a, b, d = _span(start, 1, 0), _span(start, 3, 2), _span(start, 2, 0)
         da, db, dd = _change(start, end, 1, 0), _change(start, end, 3, 2), _change(start, end, 2, 0)
@@ -65,9 +65,9 @@ def coplanarity_cubic(edges: int, start: Floats, end: Floats) -> tuple[float, fl
 
 @kernel
 def unit_root(cubic: tuple[float, float, float, float], number: int) -> float:
-    """The root in the given one (0, 1, 2) of the three intervals of [0, 1] in which a cubic is monotone, else `NEVER`."""
+    """Root of a cubic in one (0, 1, 2) of the three intervals of [0, 1] in which it is monotone, or `NEVER`."""
     _, c1, c2, c3 = cubic
-    # critical points 3 c3 t² + 2 c2 t + c1 = 0 in the form without cancellation; those outside fall on 0 or 1
+    # Critical points 3 c3 t² + 2 c2 t + c1 = 0, computed without cancellation and clamped to [0, 1].
     root = sqrt(max(c2 * c2 - 3 * c3 * c1, 0.0))
     q = -(c2 - root) if c2 < 0 else -(c2 + root)
     one, other = _unit(q, 3 * c3), _unit(c1, q)
@@ -104,7 +104,7 @@ def _value(cubic: tuple[float, float, float, float], time: float) -> float:
 
 @kernel
 def _unit(part: float, whole: float) -> float:
-    """part / whole within [0, 1]; what is not a number falls on 0."""
+    """part / whole clamped to [0, 1]; NaN gives 0."""
     if whole == 0:
         return 1.0 if part > 0 else 0.0
     time = part / whole

@@ -1,9 +1,9 @@
-"""Impact zones (Harmon et al. 2008, "Robust treatment of simultaneous collisions"): the candidate positions of a step are
-moved as little as possible, in the metric of the masses, so that nothing has passed through anything.
+"""Impact zones (Harmon et al. 2008, "Robust treatment of simultaneous collisions").
 
-Passes of detection and projection alternate until a pass finds no impact. An impact j found at time t_j is the linear
-constraint n_j · Σ w_jk x_k >= thickness with the normal and the weights at that time. All constraints found in a step
-stay; those that share points that can move are a zone, and `dual` solves each.
+The candidate positions of a step are moved so that nothing has passed through anything. The correction is the smallest one,
+weighted by the masses. Passes of detection and projection alternate until a pass finds no impact. An impact j at time t_j
+is the linear constraint n_j · Σ w_jk x_k >= thickness, with the normal and weights at that time. All constraints of a step
+remain. Those that share movable points form a zone, which `dual` solves.
 """
 
 from __future__ import annotations
@@ -24,41 +24,42 @@ from diffcloud.sim.contact.surface import SurfaceBox
 
 PASSES = 100
 _TIME_TIE = 1e-4
-"""Impacts in one interval of this length (of the step) count as simultaneous; then the order is that of the primitives."""
+"""Impacts in one interval of this length, relative to the step, count as simultaneous. They are ordered by their
+primitives."""
 TOUCH = 1e-5
-"""[m] Added to the boxes; covers the tolerances of the detection."""
+"""Margin of the boxes, which covers the tolerances of the detection [m]."""
 
 
 class Projection(NamedTuple):
-    """Choices of the impact stage."""
+    """Options of the impact stage."""
 
     thickness: float
-    """τ_p: what the projection leaves between primitives [m]."""
+    """τ_p: distance between primitives after the projection [m]."""
     smallest: float
-    """[m⁴] Pairs with |a × b|² below never meet (ARCSim: 1e-6)."""
+    """Pairs with |a × b|² below this never meet [m⁴] (ARCSim: 1e-6)."""
     residue: float
-    """Part of each correction that is left out. The original's iterative solver leaves more gap the smaller the
-    correction, which decides ties of the next step; 1e-9 reproduces that."""
+    """Fraction of each correction that is omitted. ARCSim's iterative solver leaves a larger gap for a smaller correction,
+    which decides ties in the next step. 1e-9 reproduces this."""
 
 
 class Impacts(NamedTuple):
-    """What an episode's passes found, for its derivatives. `used` counts the rows of the others."""
+    """Record of the impacts of an episode, for its derivatives. `used` counts the rows of the other fields."""
 
     met: Ints
     """[J, 5] kind and four points of each impact."""
     places: Floats
-    """[J, 9] its weights, normal against the approach, time, and sign of the normal."""
+    """[J, 9] weights, normal against the approach, time, and sign of the normal."""
     passes: Ints
-    """[P, 2] how many impacts of its step each pass knows, and how many of them are new."""
+    """[P, 2] for each pass, the number of known impacts in its step, and how many of them are new."""
     forces: Floats
-    """[., 2] λ and regularisation of every impact that a pass knows, pass after pass."""
+    """[., 2] λ and regularisation of every known impact, for each pass in turn."""
     used: Ints
-    """[3] rows of `met` (and `places`), `passes`, `forces`."""
+    """[3] number of rows of `met` (and `places`), `passes`, `forces`."""
 
 
 @kernel
 def no_impacts() -> Impacts:
-    """An empty record."""
+    """Create an empty record."""
     ints, floats = np.empty((16, 5), np.int64), np.empty((16, 9))
     return Impacts(ints, floats, np.empty((16, 2), np.int64), np.empty((16, 2)), np.zeros(3, np.int64))
 
@@ -73,16 +74,16 @@ def resolve(
     inverse_mass: Floats,
     record: Impacts,
 ) -> tuple[bool, Impacts]:
-    """Positions after the impacts of a step.
+    """Resolve the impacts of a step, in place.
 
     Args:
         near: pairs that come within `TOUCH` of each other.
         start: [N, 3] points at the start of the step, free of intersections.
-        places: [N, 3] points at its end before contact; take those after it.
+        places: [N, 3] points at the end of the step before contact; receives those after contact.
         inverse_mass: [N] [1/kg]; zero for points that cannot move.
 
     Returns:
-        (whether 100 passes sufficed, the record with the passes of this step)
+        Whether `PASSES` passes were sufficient, and the record with the passes of this step.
     """
     candidate, before = places.copy(), places.copy()
     changed = np.ones(len(places), np.bool_)
@@ -112,7 +113,7 @@ def _impacts(  # type: ignore[no-untyped-def]
     inverse_mass: Floats,
     record: Impacts,
 ) -> tuple[int, Impacts]:
-    """The impacts of this pass that are kept: in the order of time, each that shares no movable point with one before."""
+    """Detect the impacts of this pass. In order of time, keep each one that shares no movable point with an earlier one."""
     hits, times, found = np.empty((16, 1), np.int64), np.empty((16, 2)), np.empty((16, 7))
     count = 0
     x, y, place = np.empty((4, 3)), np.empty((4, 3)), np.empty(7)
@@ -134,7 +135,7 @@ def _impacts(  # type: ignore[no-untyped-def]
     if count == 0:
         return 0, record
     faces, edges = float(len(surface.faces)), float(len(surface.edges))
-    number = np.empty(count)  # the place in the list of all pairs
+    number = np.empty(count)  # position in the list of all pairs
     for h in range(count):
         c = hits[h, 0]
         number[h] = pairs[c, 5] * faces + pairs[c, 6] if pairs[c, 0] == 0 else 1e15 + pairs[c, 5] * edges + pairs[c, 6]
@@ -176,13 +177,13 @@ def _impacts(  # type: ignore[no-untyped-def]
 def _project(
     choices: Projection, candidate: Floats, places: Floats, inverse_mass: Floats, record: Impacts, first: int, fresh: int
 ) -> Impacts:
-    """Solve the zones that have new impacts and move their points; note the pass."""
+    """Solve the zones that have new impacts, move their points, and record the pass."""
     count = record.used[0] - first
     met, rows = record.met[first : first + count], record.places[first : first + count]
     passes = with_room(record.passes, record.used[1], 1)
     forces = with_room(record.forces, record.used[2], count)
     begin, known = record.used[2], 0
-    if count > fresh:  # what the pass before knew
+    if count > fresh:  # known from the previous pass
         known = passes[record.used[1] - 1, 0]
         for j in range(known):
             forces[begin + j, 0], forces[begin + j, 1] = forces[begin - known + j, 0], forces[begin - known + j, 1]
@@ -212,7 +213,7 @@ def _project(
 
 @kernel
 def take_zone(zone: Ints, row: int) -> Ints:
-    """The rows of the zone to which a row belongs; it is struck off the list."""
+    """Rows of the zone that contains `row`. They are removed from the list `zone`."""
     label, size = zone[row], 0
     members = np.empty(len(zone), np.int64)
     for other in range(len(zone)):
@@ -224,7 +225,7 @@ def take_zone(zone: Ints, row: int) -> Ints:
 
 @kernel
 def zones(met: Ints, inverse_mass: Floats) -> Ints:
-    """[J] a number for each group of impacts that are joined by points that can move."""
+    """Zone number [J] of each impact. Impacts that share movable points have the same zone."""
     parent = np.arange(len(inverse_mass))
     for j in range(len(met)):
         root = -1
@@ -254,7 +255,7 @@ def zones(met: Ints, inverse_mass: Floats) -> Ints:
 def move(
     points: Ints, rows: Floats, force: Floats, part: float, inverse_mass: Floats, candidate: Floats, places: Floats
 ) -> None:
-    """places = candidate + part · M⁻¹ Wᵀ λ at the points of rows that can move."""
+    """Set places = candidate + part · M⁻¹ Wᵀ λ for the movable points of the rows."""
     for j in range(len(points)):
         for k in range(4):
             i = points[j, k]

@@ -1,4 +1,5 @@
-"""Which pairs repel in a step: of each point, edge and face the nearest one on each of its two sides (ARCSim)."""
+"""Selection of the pairs that repel in a step: for each point, edge and face the nearest one on either side (as in
+ARCSim)."""
 
 from __future__ import annotations
 
@@ -17,35 +18,35 @@ from diffcloud.sim.contact.surface import Surface, SurfaceBox, boxed
 
 _OUTSIDE = 1e-6
 _PARALLEL = 1e-12
-"""Squared sine of the angle between two edges below which they never repel: they have no common normal, and
-derivatives without bound; what is there to hold apart points and faces do."""
+"""Squared sine of the angle between two edges below which they never repel. Such edges have no common normal, and unbounded
+derivatives. Points and faces keep them apart."""
 _TINY = 1e-30
 _TINIEST = 1e-300
 
 
 class Repulsion(NamedTuple):
-    """Numbers of the repulsion, and what obstacles alone hold of the slots."""
+    """Parameters of the repulsion. A *slot* is one side of a primitive, and keeps its nearest pair only."""
 
     stiffness: float
-    """k_c [N/m³]: times the smaller area of a pair gives its stiffness per length."""
+    """k_c [N/m³]. Multiplied by the smaller area of a pair, it gives the pair's K [N/m] (`proximity`)."""
     thickness: float
-    """τ [m]"""
+    """Distance τ at which repulsion begins [m]."""
     smallest: float
-    """[m⁴] Pairs with |a × b|² below are no contacts (ARCSim: 1e-6)."""
+    """Pairs with |a × b|² below this do not repel [m⁴] (ARCSim: 1e-6)."""
     count_once: bool
-    """Whether a pair that holds the slots of both its primitives counts once (ARCSim: twice)."""
+    """Whether a pair that has the slots of both its primitives counts once (ARCSim: twice)."""
     held: Floats
-    """[2 (P + F + E)] distance of the nearest pair of two obstacles, infinite where none, which keeps cloth pairs out
-    [m]."""
+    """[2 (P + F + E)] for each slot, the distance of the nearest pair of two obstacles, infinite if there is none [m]. More
+    distant pairs with the cloth do not get the slot."""
 
 
 @kernel
 def nearest_pairs(surface: SurfaceBox, near: Neighbours, repulsion: Repulsion, points: Floats) -> tuple[Ints, Floats]:
-    """The pairs that repel at points [N, 3]; `near` knows those that come within the thickness.
+    """Select the pairs that repel at points [N, 3]; `near` lists those that can come within the thickness.
 
     Returns:
-        (kind and points [C, 5]: 0 for a point and a face, 1 for two edges; sign, count, stiffness and whether an
-        obstacle takes part [C, 4]).
+        Kind and points [C, 5], with kind 0 for a point and a face, 1 for two edges. Constants [C, 4]: sign, count,
+        stiffness and 1 if an obstacle takes part.
     """
     pairs, found = _near(surface, near, repulsion, points)
     count = len(pairs)
@@ -86,8 +87,8 @@ def pairs_at(surface: Surface, repulsion: Repulsion, points: Floats) -> tuple[In
 
 
 def held_slots(surface: Surface, repulsion: Repulsion, points: Floats) -> Floats:
-    """`Repulsion.held` of obstacles that do not move."""
-    everything = surface._replace(movable=np.ones_like(surface.movable))  # else pairs of two obstacles are left out
+    """Compute `Repulsion.held` for static obstacles."""
+    everything = surface._replace(movable=np.ones_like(surface.movable))  # otherwise pairs of two obstacles are omitted
     return _held_slots(everything, repulsion, points)
 
 
@@ -106,7 +107,7 @@ def _held_slots(surface: Surface, repulsion: Repulsion, points: Floats) -> Float
 
 @kernel
 def _comes_before(pairs: Ints, c: int, other: int) -> bool:
-    """Whether a pair comes before another one: points and faces first, then by the primitives' numbers."""
+    """Whether a pair precedes another one: points and faces first, then by the primitives' indices."""
     if pairs[c, 0] != pairs[other, 0]:
         return pairs[c, 0] < pairs[other, 0]
     if pairs[c, 5] != pairs[other, 5]:
@@ -116,7 +117,7 @@ def _comes_before(pairs: Ints, c: int, other: int) -> bool:
 
 @kernel
 def _near(surface: SurfaceBox, near: Neighbours, repulsion: Repulsion, points: Floats) -> tuple[Ints, Floats]:
-    """The pairs nearer than the thickness: (kind, points, primitives and slots [C, 9]; distance, sign and area [C, 3])."""
+    """Pairs closer than the thickness: kind, points, primitives and slots [C, 9]; distance, sign and area [C, 3]."""
     listed = neighbours_of(surface, near, points, points)
     pairs, found = np.empty((64, 9), np.int64), np.empty((64, 3))
     count = 0
@@ -131,8 +132,8 @@ def _near(surface: SurfaceBox, near: Neighbours, repulsion: Repulsion, points: F
                 x[k, axis] = points[listed[c, 1 + k], axis]
         square = frame_at(edges, x, place)
         distance = height(place, x)
-        # pairs between one and two thicknesses hold slots in the original, but without force, and never against a
-        # nearer one
+        # In ARCSim, pairs between one and two thicknesses also take slots, but have no force, and never displace a closer
+        # pair.
         if not (square > _PARALLEL * _spanned(edges, x) and square >= repulsion.smallest):
             continue
         if not abs(distance) < repulsion.thickness:
@@ -159,7 +160,7 @@ def _near(surface: SurfaceBox, near: Neighbours, repulsion: Repulsion, points: F
 
 @kernel
 def _spanned(edges: int, x: Floats) -> float:
-    """|a|² |b|² of a pair's two edge vectors [m⁴], x [4, 3]."""
+    """|a|² |b|² of a pair's two edge vectors [m⁴], for x [4, 3]."""
     found = 1.0
     for side in range(2):
         first = 2 * side if edges > 0 else 1
@@ -173,8 +174,7 @@ def _spanned(edges: int, x: Floats) -> float:
 
 @kernel
 def _set_slots(surface: SurfaceBox, pairs: Ints, c: int, place: Floats, around: Floats) -> None:
-    """Write the slot that pair `c` takes at each of its two primitives to columns 7 and 8 of `pairs`. Each primitive has
-    one slot for each of its two sides."""
+    """Write the slots that pair `c` takes at its two primitives to columns 7 and 8 of `pairs`."""
     normal = (place[4], place[5], place[6])
     points, faces = len(surface.points), len(surface.faces)
     if pairs[c, 0] > 0:
@@ -183,7 +183,7 @@ def _set_slots(surface: SurfaceBox, pairs: Ints, c: int, place: Floats, around: 
         offset, other = points + faces, points + faces
     else:
         first = dot3(normal, around[pairs[c, 1]])
-        second = 1.0  # a face's own normal is the pair's normal: the first side of faces stays empty
+        second = 1.0  # a face's own normal is the pair's normal, so the first slot of faces stays empty
         offset, other = 0, points
     pairs[c, 7] = 2 * (pairs[c, 5] + offset) + (1 if first < 0 else 0)
     pairs[c, 8] = 2 * (pairs[c, 6] + other) + (1 if second > 0 else 0)
@@ -191,8 +191,8 @@ def _set_slots(surface: SurfaceBox, pairs: Ints, c: int, place: Floats, around: 
 
 @kernel
 def _on_outer_side(surface: SurfaceBox, edge: int, x: Floats, ends: int, others: int, place: Floats, faces: Floats) -> bool:
-    """Whether the place on the other edge (rows `others` of x) lies beyond this edge (rows `ends`) for each face at
-    it; a missing face does not object."""
+    """Whether the contact point on the other edge is beyond this edge, as seen from each of its faces. `ends` and `others`
+    are the first rows of this edge and of the other edge in x [4, 3]."""
     s, t = abs(place[others]), abs(place[others + 1])
     for side in range(2):
         face = surface.edge_faces[edge, side]
@@ -211,8 +211,8 @@ def _on_outer_side(surface: SurfaceBox, edge: int, x: Floats, ends: int, others:
 
 @kernel
 def _normals(surface: SurfaceBox, points: Floats) -> tuple[Floats, Floats]:
-    """Unit normals of faces [F, 3] and points [N, 3]; these after Max 1999: along the sum over corners of
-    (e1 × e2)/(|e1|² |e2|²)."""
+    """Unit normals of faces [F, 3] and points [N, 3]. Normals of points follow Max 1999: the direction of the sum over
+    corners of (e1 × e2)/(|e1|² |e2|²)."""
     faces, around = np.empty((len(surface.faces), 3)), np.zeros((len(points), 3))
     for f in range(len(surface.faces)):
         for corner in range(3):

@@ -1,7 +1,7 @@
-"""Pairs that can touch for a while (Verlet 1967): listed with a margin, so that one list serves several steps.
+"""Neighbour lists (Verlet 1967): pairs that can touch, listed with a margin, so that one list serves several steps.
 
-When the list is made, each point gets a box around its motion in this step and one step ahead. While all points stay within
-half of the margin around their boxes, every pair that can touch is on the list; once one leaves, the list is made again.
+When the list is built, each point gets a box around its motion in this step and the next. While all points stay within half
+of the margin around their boxes, the list contains every pair that can touch. Otherwise it is built again.
 """
 
 from __future__ import annotations
@@ -17,23 +17,23 @@ from diffcloud.sim.contact.broad_phase import boxes_of, candidates, corners_of, 
 from diffcloud.sim.contact.surface import SurfaceBox
 
 _MARGIN = 0.5
-"""Of typical edges of the cloth: a wider one lists more pairs less often."""
+"""Margin relative to a typical edge length of the cloth. A larger margin lists more pairs less often."""
 _AHEAD = 1.0
-"""The boxes reach so many steps beyond the one at hand."""
+"""Number of steps by which the boxes extend beyond the current one."""
 _ROUNDING = 1e-9
 
 
 class NeighboursType(BoxType):  # type: ignore[misc]
-    """Of `Neighbours`."""
+    """Numba type of `Neighbours`."""
 
 
 class Neighbours(Box):  # type: ignore[misc]
-    """The pairs, and where they hold.
+    """The list of pairs, and the region in which it is valid.
 
     Fields:
-        distance: boxes that come so near to each other belong to listed pairs [m].
-        margin: [m]
-        low, high: [N, 3] the box of each point [m].
+        distance: pairs whose boxes come this close to each other are listed [m].
+        margin: distance by which the list exceeds this [m].
+        low, high: [N, 3] box of each point [m].
         pairs: [C, 7] kind (1: two edges), points and primitives.
     """
 
@@ -43,7 +43,7 @@ define(Neighbours, NeighboursType, ["distance", "margin", "low", "high", "pairs"
 
 @kernel
 def no_neighbours(surface: SurfaceBox, distance: float) -> Neighbours:
-    """Nothing listed yet."""
+    """Create an empty list."""
     shape = (surface.point_count, 3)
     margin = _MARGIN * sqrt(surface.typical_face_area[0])
     return Neighbours(distance, margin, np.full(shape, np.inf), np.full(shape, -np.inf), np.empty((0, 7), np.int64))
@@ -51,7 +51,7 @@ def no_neighbours(surface: SurfaceBox, distance: float) -> Neighbours:
 
 @kernel
 def neighbours_of(surface: SurfaceBox, known: Neighbours, start: Floats, end: Floats) -> Ints:
-    """The pairs [C, 7] that can touch while points go straight from `start` to `end` [N, 3], and others."""
+    """Pairs [C, 7], among them all that can touch while points move straight from `start` to `end` [N, 3]."""
     if not (_are_inside(known, start) and _are_inside(known, end)):
         low, high = known.low, known.high
         for i in range(len(start)):
@@ -90,7 +90,7 @@ def _listed(surface: SurfaceBox, low: Floats, high: Floats, distance: float) -> 
 
 @kernel
 def meeting(surface: SurfaceBox, pairs: Ints, start: Floats, end: Floats, distance: float) -> Ints:
-    """The rows of the pairs whose boxes come within a distance of each other [m] while points go from start to end."""
+    """Rows of the pairs whose boxes come within `distance` of each other [m] while points move from start to end."""
     points, faces, edges = boxes_of(surface, start, end, distance)
     found = np.empty(len(pairs), np.int64)
     count = 0

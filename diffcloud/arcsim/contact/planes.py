@@ -1,17 +1,17 @@
 """Contact of ARCSim's step with half-spaces n · x >= offset: repulsion and lagged Coulomb friction.
 
-Repulsion (ARCSim, thickness τ): violation c = max(τ + offset - n · x, 0), energy K c³/(6 τ) with K = k_c times the node's
-material area; force K c²/(2 τ) along n, stiffness K c/τ.
+Repulsion has the thickness τ, the violation c = max(τ + offset - n · x, 0), and the energy K c³/(6 τ). K is k_c times the
+node's material area. The force is K c²/(2 τ) along n, and the stiffness K c/τ.
 
-Friction (lagged: normal force and sliding direction of the start of the step): γ = min(μ f_n / |v_t|, m / Δt), force
--γ P v with P = I - n nᵀ, implicit in v. The second branch is sticking: it halves the sliding velocity in each
-step, so a node on an incline of angle α creeps at g sin(α) Δt, which vanishes with the step.
+Friction uses the normal force f_n and sliding direction at the start of the step (lagged). With γ = min(μ f_n / |v_t|,
+m / Δt), the force is -γ P v with P = I - n nᵀ, implicit in v. The second branch is sticking: it halves the sliding velocity
+in each step. So a node on an incline of angle α creeps at g sin(α) Δt, which vanishes with the step.
 
-Projection (`step.project`): a node whose candidate position is behind the plane is put at the projection thickness above
+Projection (`step.project`): a node whose candidate position is behind the plane is moved to the projection thickness above
 it. For a single static plane this is the exact solution of the impact-zone problem (nodes do not couple), and inelastic.
 
-Not reproduced from ARCSim: the doubled constraint of the node nearest to each obstacle face, contacts of cloth edges
-with the obstacle's edges, and the plane's finite extent.
+Not reproduced from ARCSim: the doubled constraint of the node nearest to each obstacle face, contacts of cloth edges with
+the obstacle's edges, and the plane's finite extent.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ _TINY = 1e-12
 
 
 def force(node: Element) -> Sequence[Vector]:
-    """Repulsion to first order in the motion of the step, and friction of the velocity at its end."""
+    """Repulsion, to first order in the motion of the step, and friction with the velocity at the end of the step [N]."""
     normal, thickness = node.vector("normal"), node.constant("thickness")
     violation = maximum(thickness + node.constant("offset") - dot(node.positions[0], normal), 0.0)
     stiffness = violation * (node.constant("stiffness") / thickness)
@@ -47,7 +47,7 @@ def force(node: Element) -> Sequence[Vector]:
 
 
 def build(setup: Setup) -> Elements | None:
-    """Every node with every plane."""
+    """Elements: every node with every plane."""
     if not setup.surrounding.proximity:
         return None
     normals, offsets = stopping_planes(setup.mesh, setup.surrounding)
@@ -76,7 +76,7 @@ PLANES = Term(
 
 
 def stopping_planes(mesh: ClothMesh, surrounding: Surrounding) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """The half-spaces that stop nodes (`half_spaces`); none where contact with meshes covers them."""
+    """The half-spaces that stop nodes (`half_spaces`); none if contact with meshes already includes them."""
     if surrounding.reference_contact is not None:
         surrounding = replace(surrounding, obstacles=())
     return half_spaces(mesh, surrounding)

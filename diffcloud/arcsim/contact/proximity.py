@@ -1,12 +1,14 @@
 """Repulsion and lagged friction between meshes, as forces of ARCSim's step.
 
-A pair at distance h, with n turned so that h > 0, violates the thickness τ by c = max(τ - h, 0). Energy K c³/(6 τ) with
-K = k_c times the smaller area; force K c²/(2 τ) along n, stiffness K c/τ, shared over the four points by the weights w.
-Friction is γ = min(μ f_n/|P v|, 1/(Δt Σ w_k²/m_k)) times the sliding velocity P v, P = I - n nᵀ. In γ the force f_n and
-the velocity v = Σ w_k v_k are those of the start of the step; the sliding velocity itself is implicit.
+A pair at distance h, with the normal n oriented so that h > 0, violates the thickness τ by c = max(τ - h, 0). The energy is
+K c³/(6 τ) with K = k_c times the smaller area. The force is K c²/(2 τ) along n, the stiffness K c/τ. Weights w distribute
+both over the four points.
 
-`nearest` says which pairs: each point, edge and face has a slot on each of its two sides that keeps only the nearest
-pair. A pair that holds two slots counts twice in the original (`count_once` off).
+Friction is γ = min(μ f_n/|P v|, 1/(Δt Σ w_k²/m_k)) times the sliding velocity P v, with P = I - n nᵀ. In γ, the normal
+force f_n and the velocity v = Σ w_k v_k are those at the start of the step. The sliding velocity itself is implicit.
+
+`nearest` selects the pairs: each point, edge and face has one slot per side, which keeps the nearest pair only. In ARCSim,
+a pair with two slots counts twice (`count_once` off).
 """
 
 from __future__ import annotations
@@ -22,7 +24,7 @@ _TINY = 1e-12
 
 
 def force(kind: Kind, pair: Element) -> Sequence[Vector]:
-    """Repulsion to first order in the motion of the step, and friction of the velocity at its end."""
+    """Repulsion, to first order in the motion of the step, and friction with the velocity at the end of the step [N]."""
     weights, normal = frame(kind, pair.positions)
     normal = pair.constant("sign") * normal
 
@@ -56,5 +58,5 @@ def _term(kind: Kind) -> Term:
 
 PROXIMITY_POINT_FACE = _term("point_face")
 PROXIMITY_EDGE_EDGE = _term("edge_edge")
-"""Constants: what turns the normal towards the first primitive; how often the pair counts; k_c times the area [N/m];
-1 where an obstacle takes part; τ [m]."""
+"""Constants: sign that turns the normal towards the first primitive; how often the pair counts; k_c times the area [N/m]; 1
+if an obstacle takes part; τ [m]."""

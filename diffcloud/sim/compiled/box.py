@@ -1,14 +1,14 @@
-"""Boxes: what many kernels share, passed as one pointer.
+"""Boxes: structures with named fields that kernels pass by pointer.
 
-A kernel that is given a named tuple of fifty arrays gets their hundreds of numbers one by one, and compiling each
-call takes a second. A box is a place in memory with named fields, which kernels read and write; only the fields that
-a kernel names cost it anything. A module makes one in three lines:
+Numba passes a named tuple of fifty arrays as hundreds of separate arguments, and compiling each call takes a second. A box
+is passed as one pointer. Kernels read and write its fields by name, and a kernel only pays for the fields that it uses. A
+module defines a box in three lines:
 
     class RoomType(BoxType): ...
     class Room(Box): ...
     define(Room, RoomType, ["size", "pairs"])
 
-`Room(size, pairs)` makes one inside a kernel. A field keeps the type that it was made with.
+`Room(size, pairs)` creates one inside a kernel. The type of a field cannot change afterwards.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ from numba.experimental import structref
 from diffcloud.compiled import UNCOMPILED
 
 BoxType: Any = types.StructRef
-"""Of the numba type that belongs to a box; its class must be a module's own, where the cache finds it."""
+"""Base class of the numba type of a box. Its subclass must be defined in a module, where numba's cache can find it."""
 
 
 class _Plain:
-    """A box without numba."""
+    """A box for runs without compilation."""
 
     fields: Sequence[str] = ()
 
@@ -39,7 +39,7 @@ Box: Any = _Plain if UNCOMPILED else structref.StructRefProxy
 
 
 def define(box: Any, kind: Any, fields: Sequence[str]) -> None:
-    """Let kernels make boxes of a class, and read and write their fields."""
+    """Register a box class, so that kernels can create boxes and access their fields."""
     if UNCOMPILED:
         box.fields = tuple(fields)
     else:

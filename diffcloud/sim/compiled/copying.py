@@ -1,4 +1,4 @@
-"""Copies inside kernels."""
+"""Array copies inside kernels."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from diffcloud.sim.compiled.data import Floats, Ints
 
 @kernel
 def copy_to(target: Floats | Ints, source: Floats | Ints) -> None:
-    """target[:] = source, of one or two axes and equal shapes. Numba's own assignment compiles for seconds, because it can
-    also write a message about shapes that differ."""
+    """target[:] = source, for arrays of equal shape with one or two axes. Numba's own assignment takes seconds to compile,
+    because it includes an error message for different shapes."""
     if target.ndim == 1:
         for i in range(len(source)):
             target[i] = source[i]

@@ -8,7 +8,8 @@ from diffcloud.sim.compiled.data import Floats, Ints
 
 @kernel
 def lu(matrix: Floats, pivots: Ints) -> bool:
-    """Factorise a matrix [n, n] in place; pivots [n] takes the row that each one was exchanged with. False: singular."""
+    """Factorise a matrix [n, n] in place; `pivots` [n] receives the row with which each row was swapped. Return False if
+    the matrix is singular."""
     count = len(matrix)
     for k in range(count):
         best = k
@@ -32,9 +33,9 @@ def lu(matrix: Floats, pivots: Ints) -> bool:
 
 @kernel
 def lu_solve(matrix: Floats, pivots: Ints, right: Floats) -> None:
-    """Solve with a factorised matrix; `right` [n] takes the solution."""
+    """Solve a linear system with a factorised matrix; `right` [n] is replaced by the solution."""
     count = len(matrix)
-    for k in range(count):  # all exchanges first: later ones have moved the rows of the factor, too
+    for k in range(count):  # all row swaps first: later swaps also permuted the rows of the factor
         right[k], right[pivots[k]] = right[pivots[k]], right[k]
     for k in range(count):
         for i in range(k + 1, count):
@@ -47,7 +48,7 @@ def lu_solve(matrix: Floats, pivots: Ints, right: Floats) -> None:
 
 @kernel
 def lu_solve_transposed(matrix: Floats, pivots: Ints, right: Floats) -> None:
-    """The same with the transposed matrix."""
+    """Solve the system with the transposed matrix; `right` [n] is replaced by the solution."""
     count = len(matrix)
     for k in range(count):
         for j in range(k):

@@ -1,8 +1,8 @@
-"""Derivatives of formulas, as formulas.
+"""Symbolic derivatives of formulas.
 
-Where a function has a corner its derivative is the one that torch takes, since the twins in tests/ are written in torch:
-that of the side which holds for `maximum` with a constant (the argument's own at equality), half of both for
-`minimum` of two arguments, zero for `absolute` at zero, and zero for everything that picks a place in a table.
+Where a function is not smooth, the derivative is that of torch, because the reference implementations in tests/ use torch:
+that of the active side for `maximum` with a constant (of the argument at equality), half of both for `minimum` of equal
+arguments, zero for `absolute` at zero, and zero for every table index.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ def gradient(output: Scalar, inputs: Sequence[Scalar]) -> list[Scalar]:
 
 
 def directional(outputs: Sequence[Scalar], inputs: Sequence[Scalar], rates: Sequence[Scalar]) -> list[Scalar]:
-    """How the outputs change when each input changes at its rate, by forward accumulation."""
+    """Directional derivatives of the outputs for given rates of the inputs, by forward accumulation."""
     zero = outputs[0].graph.constant(0.0)
     one = outputs[0].graph.constant(1.0)
     known = {source.number: rate for source, rate in zip(inputs, rates, strict=True)}
@@ -46,7 +46,7 @@ def directional(outputs: Sequence[Scalar], inputs: Sequence[Scalar], rates: Sequ
 
 
 def _partials(node: Scalar, slope: Scalar) -> list[tuple[Scalar, Scalar]]:
-    """(operand, slope times d node / d operand) of each operand that has one."""
+    """Pairs (operand, slope times d node / d operand) for each differentiable operand."""
     a = node.operands[0] if node.operands else None
     match node.operation, node.operands:
         case "add", (p, q):
@@ -84,7 +84,7 @@ def _partials(node: Scalar, slope: Scalar) -> list[tuple[Scalar, Scalar]]:
 
 
 def _depending(output: Scalar, inputs: Sequence[Scalar]) -> set[int]:
-    """Numbers of the nodes between the inputs and the output that have derivatives by an input."""
+    """Numbers of the nodes between inputs and output that depend differentiably on an input."""
     sources = {one.number for one in inputs}
     found: set[int] = set()
     for node in ordered([output]):

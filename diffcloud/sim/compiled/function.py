@@ -1,4 +1,4 @@
-"""Functions of a few numbers, written once as a formula like the terms: value, reverse and tangent are generated."""
+"""Functions of a few numbers, defined by a formula. Code for value, gradient and tangent is generated."""
 
 from __future__ import annotations
 
@@ -12,11 +12,13 @@ from diffcloud.sim.compiled.trace import Graph, Scalar
 
 @dataclass(frozen=True, eq=False)
 class Function:
-    """outputs = formula(inputs, constants), all flat lists of numbers.
+    """A function outputs = formula(inputs, constants) of flat lists of numbers.
 
-    Generated: `<name>_value(inputs, constants, outputs)`, `<name>_reverse(inputs, constants, adjoint, gradients)` adds the
-    gradients of adjoint · outputs, `<name>_tangent(inputs, constants, rates, output_rates)` gives the rates [K,
-    outputs] along the directions [K, inputs].
+    Generated kernels:
+
+    - `<name>_value(inputs, constants, outputs)` computes the outputs.
+    - `<name>_reverse(inputs, constants, adjoint, gradients)` adds the gradients of adjoint · outputs.
+    - `<name>_tangent(inputs, constants, rates, output_rates)` computes derivatives [K, outputs] along K directions.
     """
 
     name: str
@@ -25,7 +27,7 @@ class Function:
     formula: Callable[[Sequence[Scalar], Sequence[Scalar]], Sequence[Scalar]]
 
     def sources(self) -> list[str]:
-        """The three functions' code."""
+        """Source code of the three kernels."""
         graph = Graph()
         inputs = [graph.input(f"inputs[{k}]") for k in range(self.inputs)]
         outputs = list(self.formula(inputs, [graph.input(f"constants[{k}]") for k in range(self.constants)]))

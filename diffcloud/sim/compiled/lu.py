@@ -1,10 +1,10 @@
-"""LU by 3 x 3 blocks, for matrices without symmetry in a symmetric pattern, and dense LU where that goes wrong.
+"""Sparse LU of nonsymmetric matrices with a symmetric pattern, in 3 x 3 blocks, with dense LU as a fallback.
 
     A = L U,   L_jj = I,   U_jj = D_j
 
-Both halves are kept in the pattern of the lower factor: L as it is, with D_j⁻¹ in the place of its diagonal, and U
-transposed. No rows are exchanged beyond the blocks, which is fine where the diagonal is strong; the residual of the first
-solution is looked at, and where it is large all systems of the matrix are solved by dense LU with pivots.
+Both factors are stored in the pattern of the lower one: L with D_j⁻¹ on its diagonal, and U transposed. There is no
+pivoting beyond the blocks, which is accurate for matrices with a strong diagonal. The residual of the first solution is
+checked. If it is large, dense LU with pivoting solves all systems with this matrix.
 """
 
 from __future__ import annotations
@@ -18,23 +18,23 @@ from diffcloud.sim.compiled.dense import lu, lu_solve, lu_solve_transposed
 from diffcloud.sim.compiled.sparse import Pattern, _await_next, _take_off
 
 _GOOD = 1e-9
-"""Residual, relative to the sizes of the matrix and of both sides, below which a solution counts."""
+"""Largest acceptable residual of a solution, relative to the sizes of the matrix and of both sides."""
 
 
 class GeneralType(BoxType):  # type: ignore[misc]
-    """Of `General`."""
+    """Numba type of `General`."""
 
 
 class General(Box):  # type: ignore[misc]
-    """A matrix without symmetry, and its factors.
+    """A nonsymmetric matrix and its factors.
 
     Fields:
         pattern: `sparse.Pattern`
         lower: [A + 1, 9] blocks of the lower half and the diagonal.
-        upper: [A + 1, 9] blocks of the upper half, transposed; its diagonal counts for nothing.
-        below: [L, 9] L, with the inverse of D in the place of its diagonal.
+        upper: [A + 1, 9] blocks of the upper half, transposed; its diagonal is unused.
+        below: [L, 9] L, with D⁻¹ on its diagonal.
         above: [L, 9] U transposed, without its diagonal.
-        sound: 1 once a solution by the factors has been looked at and is right; -1 where it is not; 0 before.
+        sound: 1 if a solution by the factors was checked and is accurate; -1 if it is not; 0 before the check.
     """
 
 
@@ -43,7 +43,7 @@ define(General, GeneralType, ["pattern", "lower", "upper", "below", "above", "so
 
 @kernel
 def factorised(of: Pattern, lower: Floats, upper: Floats) -> General:
-    """The matrix with its factors; where a pivot is singular they hold numbers that are not finite."""
+    """Factorise a matrix. If a pivot is singular, the factors contain non-finite numbers."""
     count = len(of.place)
     starts, rows = of.factor_starts, of.factor_rows
     below, above = np.empty((len(rows), 9)), np.empty((len(rows), 9))
@@ -86,7 +86,7 @@ def factorised(of: Pattern, lower: Floats, upper: Floats) -> General:
 
 @kernel
 def _invert(blocks: Floats, given: int, inverses: Floats, taken: int) -> None:
-    """The inverse of one of the blocks [., 9], into one of others."""
+    """Write the inverse of block `given` [., 9] to block `taken` of `inverses`."""
     m, n, o = blocks[given, 0], blocks[given, 1], blocks[given, 2]
     p, q, r = blocks[given, 3], blocks[given, 4], blocks[given, 5]
     s, t, u = blocks[given, 6], blocks[given, 7], blocks[given, 8]
@@ -99,7 +99,7 @@ def _invert(blocks: Floats, given: int, inverses: Floats, taken: int) -> None:
 
 @kernel
 def solve_general(of: General, right: Floats, transposed: int, solution: Floats) -> bool:
-    """solution [V, 3] of A x = right, or of Aᵀ x = right; False: the matrix is singular."""
+    """Solve A x = right or Aᵀ x = right into `solution` [V, 3]. Return False if the matrix is singular."""
     if transposed > 0:
         _substitute(of.pattern, of.below, of.above, of.below, right, 1, solution)
     else:
@@ -115,7 +115,7 @@ def solve_general(of: General, right: Floats, transposed: int, solution: Floats)
 def _substitute(
     of: Pattern, below: Floats, first: Floats, second: Floats, right: Floats, transposed: int, solution: Floats
 ) -> None:
-    """Forwards through one half, backwards through the other one."""
+    """Forward substitution with one factor, then backward substitution with the other."""
     place, starts, rows = of.place, of.factor_starts, of.factor_rows
     count = len(place)
     work = np.empty((count, 3))
@@ -125,7 +125,7 @@ def _substitute(
     for j in range(count):
         own, d = work[j], below[starts[j]]
         a, b, c = own[0], own[1], own[2]
-        if transposed > 0:  # the diagonal blocks belong to U, which comes first then
+        if transposed > 0:  # the diagonal blocks belong to U, which comes first here
             own[0], own[1], own[2] = (
                 d[0] * a + d[3] * b + d[6] * c,
                 d[1] * a + d[4] * b + d[7] * c,
@@ -160,7 +160,7 @@ def _substitute(
 
 @kernel
 def _judged(of: General, right: Floats, transposed: int, solution: Floats) -> int:
-    """1: what a solution leaves over is small; -1: it is not; 0: it solves for nothing, which tells nothing of factors."""
+    """Check a solution's residual. Return 1: small; -1: large; 0: unknown, because all terms are zero."""
     pattern, low, high = of.pattern, of.lower, of.upper
     count = len(pattern.place)
     node = np.empty(count, np.int64)
@@ -182,7 +182,7 @@ def _judged(of: General, right: Floats, transposed: int, solution: Floats) -> in
                     left[row, r] -= part
                     size[row, r] += abs(part)
                     if i != j:
-                        part = upper[3 * r + c] * solution[row, r]  # the block (j, i), transposed
+                        part = upper[3 * r + c] * solution[row, r]  # block (j, i), transposed
                         left[column, c] -= part
                         size[column, c] += abs(part)
     worst, largest = 0.0, 0.0
@@ -198,7 +198,7 @@ def _judged(of: General, right: Floats, transposed: int, solution: Floats) -> in
 
 @kernel
 def _dense(of: General, right: Floats, transposed: int, solution: Floats) -> bool:
-    """The solution by dense LU; False: singular, and the solution is no number."""
+    """Solve by dense LU. Return False, with NaN or inf in the solution, if the matrix is singular."""
     pattern, low, high = of.pattern, of.lower, of.upper
     count = len(pattern.place)
     matrix = np.zeros((3 * count, 3 * count))

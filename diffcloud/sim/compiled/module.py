@@ -1,11 +1,17 @@
-"""From lists of terms to modules of kernels.
+"""Generates modules of kernels from force terms.
 
-For each term five functions over its elements: `<name>_force` adds its forces, `<name>_assemble` also gives its part of
-the symmetric step matrix, `<name>_jacobian` its exact derivatives for the implicit step, `<name>_reverse` adds the
-gradients of y · f, `<name>_tangent` how f changes along some directions. `<name>_energy` adds what its elements store.
-Matrices come as 3 x 3 blocks, row by row, for each pair of an element's nodes. One module has the terms that all
-integrators share, so that their kernels are compiled once; each integrator's module adds its own. They are written into the
-cache folder, where they can be read.
+Each term gives these functions over its elements:
+
+- `<name>_force` adds its forces.
+- `<name>_assemble` also adds its part of the symmetric step matrix.
+- `<name>_jacobian` computes the exact derivatives for the implicit step.
+- `<name>_reverse` adds the gradients of y · f.
+- `<name>_tangent` adds the directional derivatives of f.
+- `<name>_energy` adds the stored energy.
+
+Matrices consist of 3 x 3 blocks in row-major order, one for each pair of an element's nodes. One module contains the terms
+that all integrators share, so their kernels are compiled once. Each integrator's module adds its own terms. The source
+files are in the cache folder, where they can be read.
 """
 
 from __future__ import annotations
@@ -49,7 +55,7 @@ _ARGUMENTS = {
 
 @cache
 def shared_kernels(terms: tuple[Term, ...]) -> ModuleType:
-    """The kernels of each of some terms, written once for each state of the sources."""
+    """Kernels of the shared terms, generated once per version of the sources."""
     return _module("shared", lambda: shared_source(terms))
 
 
@@ -61,13 +67,13 @@ def integrator_kernels(
     contacts: tuple[Term, ...],
     functions: tuple[Function, ...],
 ) -> ModuleType:
-    """The kernels of an integrator's terms, contacts and functions, written once for each state of the sources.
+    """Kernels of an integrator's terms, contacts and functions, generated once per version of the sources.
 
     Args:
-        shared: terms that other integrators have too.
-        own: further terms whose elements are known before the motion; `force`, `assemble` and so on go through both.
-        contacts: whose elements each step finds.
-        functions: of a few numbers, that have derivatives too.
+        shared: terms of all integrators.
+        own: further terms with fixed elements; `force`, `assemble` and so on include both.
+        contacts: terms whose elements each step detects.
+        functions: differentiable functions of a few numbers.
     """
     module = shared_kernels(shared)
     return _module(integrator, lambda: integrator_source(module, shared, own, contacts, functions))
@@ -89,7 +95,7 @@ def _module(name: str, source: Callable[[], str]) -> ModuleType:
 
 
 def shared_source(terms: Sequence[Term]) -> str:
-    """The text of the module of shared terms."""
+    """Source code of the module of shared terms."""
     parts, stiff = _terms(terms)
     return "\n\n".join([_HEAD, *parts, f"STIFF = {stiff!r}"]) + "\n"
 
@@ -101,7 +107,7 @@ def integrator_source(
     contacts: Sequence[Term],
     functions: Sequence[Function],
 ) -> str:
-    """The text of an integrator's module, on top of that of the shared terms."""
+    """Source code of an integrator's module, which imports the module of shared terms."""
     parts, stiff = _terms([*own, *contacts])
     terms = [*shared, *own]
     parts.append(f"Terms = namedtuple('Terms', {[term.name for term in terms]!r})")
@@ -111,7 +117,7 @@ def integrator_source(
 
 
 def _terms(terms: Sequence[Term]) -> tuple[list[str], dict[str, list[str]]]:
-    """Each term's kernels, and the names of those that add to matrices of each kind."""
+    """Source code of each term's kernels, and the names of the terms that contribute to each kind of matrix."""
     parts: list[str] = []
     stiff: dict[str, list[str]] = {"assemble": [], "jacobian": []}
     for term in terms:
@@ -128,7 +134,7 @@ def _terms(terms: Sequence[Term]) -> tuple[list[str], dict[str, list[str]]]:
 
 
 def _all(kind: str, terms: Sequence[Term], stiff: set[str]) -> str:
-    """The function of all terms together, which adds blocks to the step matrix."""
+    """Source code of the function that calls a kernel of all terms and adds their blocks to the step matrix."""
     arguments = _ARGUMENTS[kind]
     target = {"assemble": "matrix", "jacobian": "lower, upper"}.get(kind)
     lines = []
@@ -148,7 +154,7 @@ def _all(kind: str, terms: Sequence[Term], stiff: set[str]) -> str:
 
 
 def _force(term: Term) -> str:
-    """force += f"""
+    """Code for force += f."""
     formula = _Formula(term)
     code = Code()
     code.compute(formula.force)
@@ -156,7 +162,7 @@ def _force(term: Term) -> str:
 
 
 def _energy(term: Term) -> str:
-    """energy[0] += what the elements store"""
+    """Code for energy[0] += stored energy of the elements."""
     assert term.energy is not None
     stored = term.energy(Element(term, Graph()))
     code = Code()
@@ -165,7 +171,7 @@ def _energy(term: Term) -> str:
 
 
 def _assemble(term: Term) -> str:
-    """force += f; blocks [a, b >= a] of displaced (-∂f/∂d) + moved (-∂f/∂after), which is symmetric."""
+    """Code for force += f and the symmetric blocks [a, b >= a] of displaced (-∂f/∂d) + moved (-∂f/∂after)."""
     formula = _Formula(term)
     displaced, moved = formula.graph.input("displaced"), formula.graph.input("moved")
     rows = [gradient(part, [*formula.displacement, *formula.after]) for part in formula.force]
@@ -179,10 +185,8 @@ def _assemble(term: Term) -> str:
 
 
 def _jacobian(term: Term) -> str:
-    """blocks [a, b] of displaced (-∂f/∂d) + moved (-∂f/∂before - ∂f/∂after) + moved · time_step (-∂f/∂x).
-
-    One column after the other, in a loop: written out, the code would take seconds to compile.
-    """
+    """Code for the blocks [a, b] of displaced (-∂f/∂d) + moved (-∂f/∂before - ∂f/∂after) + moved · time_step (-∂f/∂x). The
+    code loops over columns: unrolled code would take seconds to compile."""
     formula = _Formula(term)
     groups = (formula.positions, formula.displacement, formula.before, formula.after)
     names = ("-moved * timing.time_step", "-displaced", "-moved", "-moved")
@@ -194,7 +198,7 @@ def _jacobian(term: Term) -> str:
     if all(change.value == 0 for change in changes):
         return _loop(term, "jacobian", ["pass"])
     code = Code()
-    code.compute(_independent(changes, {rate.number for rate in rates}))  # once for all columns
+    code.compute(_independent(changes, {rate.number for rate in rates}))  # computed once for all columns
     shared = len(code.lines)
     code.compute(changes)
     size = 3 * term.corners
@@ -206,7 +210,7 @@ def _jacobian(term: Term) -> str:
 
 
 def _reverse(term: Term) -> str:
-    """Gradients of adjoint · f."""
+    """Code for the gradients of adjoint · f."""
     formula = _Formula(term)
     weighted = formula.graph.constant(0.0)
     for k, part in enumerate(formula.force):
@@ -223,13 +227,13 @@ def _reverse(term: Term) -> str:
 
 
 def _tangent(term: Term) -> str:
-    """force_rates[k] += how f changes along direction k."""
+    """Code for force_rates[k] += derivative of f along direction k."""
     formula = _Formula(term)
     rates = [formula.graph.input(_rate_source(source)) for source, _ in formula.inputs]
     changes = directional(formula.force, [scalar for _, scalar in formula.inputs], rates)
     along = {rate.number for rate in rates}
     code = Code()
-    code.compute(_independent(changes, along))  # once for all directions
+    code.compute(_independent(changes, along))  # computed once for all directions
     shared = len(code.lines)
     code.compute(changes)
     inner = code.lines[shared:]
@@ -239,7 +243,7 @@ def _tangent(term: Term) -> str:
 
 
 class _Formula:
-    """A term's formula and the numbers it depends on."""
+    """A term's formula and its inputs."""
 
     def __init__(self, term: Term) -> None:
         self.graph = Graph()
@@ -251,7 +255,7 @@ class _Formula:
         self.positions, self.before = _numbers(element.positions), _numbers(element.before)
         self.after, self.displacement = _numbers(element.after), _numbers(element.displacement)
         self.inputs: list[tuple[str, Scalar]] = []
-        """(code, number) of everything it can be differentiated by."""
+        """(code, number) of every differentiable input."""
         groups = zip(Motion._fields, (self.positions, self.before, self.after, self.displacement), strict=True)
         self.inputs += [(str(one.payload), one) for _, group in groups for one in group]
         for name, place in term.parameters.items():
@@ -266,7 +270,7 @@ def _added_forces(formula: _Formula, code: Code) -> list[str]:
 
 
 def _stored(found: Sequence[Sequence[Scalar]], code: Code) -> list[str]:
-    """Lines that store blocks; none where all are zero."""
+    """Code lines that store blocks; empty if all blocks are zero."""
     if all(one.value == 0 for block in found for one in block):
         return []
     code.compute(one for block in found for one in block)
@@ -278,18 +282,18 @@ def _numbers(vectors: Iterable[Vector]) -> list[Scalar]:
 
 
 def _rate_source(source: str) -> str:
-    """parameters.x[e] -> parameter_rates.x[k, e]"""
+    """Rename an input to its derivative along direction k: parameters.x[e] -> parameter_rates.x[k, e]."""
     name, index = _renamed(source, "rates").split("[", 1)
     return f"{name}[k, {index}"
 
 
 def _renamed(source: str, of: str) -> str:
-    """The same place of the arrays that hold gradients, or rates."""
+    """Rename an array to that of its gradients or derivatives."""
     return source.replace("parameters.", f"parameter_{of}.").replace("motion.", f"motion_{of}.")
 
 
 def _independent(outputs: Sequence[Scalar], of: set[int]) -> list[Scalar]:
-    """The largest parts of the outputs that do not depend on some nodes."""
+    """Largest subexpressions of the outputs that do not depend on the given nodes."""
     depending = set(of)
     found: dict[int, Scalar] = {}
     for node in ordered(outputs):

@@ -1,8 +1,8 @@
-"""An order of elimination that keeps the factors of a sparse symmetric pattern small.
+"""Elimination order of a sparse symmetric pattern that keeps its factors small.
 
-Approximate minimum degree (Amestoy, Davis and Duff 1996): the node with the fewest neighbours is eliminated next, which
-joins its neighbours to each other. What it joins is kept as one *element*, the list of its neighbours, instead of all
-pairs; elements whose nodes all belong to a new one are dropped. A degree counts nodes twice that two elements share.
+Approximate minimum degree (Amestoy, Davis and Duff 1996): repeatedly eliminate the node with the fewest neighbours, which
+connects its neighbours with each other. Instead of all these pairs, an *element* stores the list of these neighbours. An
+element whose nodes all belong to a new element is removed. A degree counts a node twice if two elements share it.
 """
 
 from __future__ import annotations
@@ -16,20 +16,20 @@ from diffcloud.sim.compiled.pool import with_room
 
 @kernel
 def minimum_degree(starts: Ints, neighbours: Ints) -> Ints:
-    """Return the place [V] of each node in the order of elimination.
+    """Return the position [V] of each node in the elimination order.
 
     Args:
-        starts: [V + 1] of each node's list in `neighbours`, which is overwritten.
-        neighbours: other nodes that each node shares a block with, each pair in both lists.
+        starts: [V + 1] start of each node's list in `neighbours`, which is overwritten.
+        neighbours: the nodes with which each node shares a block. Each pair is in both lists.
     """
     count = len(starts) - 1
     place, degree = np.full(count, -1, np.int64), np.empty(count, np.int64)
-    own, joined = np.empty(count, np.int64), np.zeros(count, np.int64)  # how many neighbours and elements each node has
-    elements = np.empty_like(neighbours)  # of each node: never more than it had neighbours at first
-    first, next_one = np.full(count + 1, -1, np.int64), np.empty(count, np.int64)  # nodes of each degree
+    own, joined = np.empty(count, np.int64), np.zeros(count, np.int64)  # number of neighbours and of elements of each node
+    elements = np.empty_like(neighbours)  # elements of each node, at most as many as its initial neighbours
+    first, next_one = np.full(count + 1, -1, np.int64), np.empty(count, np.int64)  # lists of the nodes of each degree
     before = np.empty(count, np.int64)
-    nodes, used = np.empty((4 * len(neighbours) + count, 1), np.int64), 0  # of all elements, end to end
-    begin, size = np.empty(count, np.int64), np.zeros(count, np.int64)  # of each element in `nodes`; 0: dropped
+    nodes, used = np.empty((4 * len(neighbours) + count, 1), np.int64), 0  # nodes of all elements, concatenated
+    begin, size = np.empty(count, np.int64), np.zeros(count, np.int64)  # of each element in `nodes`; size 0: removed
     mark, seen, outside = np.full(count, -1, np.int64), np.full(count, -1, np.int64), np.empty(count, np.int64)
     for i in range(count - 1, -1, -1):
         own[i] = degree[i] = starts[i + 1] - starts[i]
@@ -56,7 +56,7 @@ def minimum_degree(starts: Ints, neighbours: Ints) -> Ints:
                     used += 1
             size[e] = 0
         size[pivot] = used - begin[pivot]
-        for r in range(begin[pivot], used):  # how many nodes of other elements are not in the new one
+        for r in range(begin[pivot], used):  # number of nodes of other elements outside the new one
             i = nodes[r, 0]
             for q in range(starts[i], starts[i] + joined[i]):
                 e = elements[q]
@@ -89,7 +89,7 @@ def minimum_degree(starts: Ints, neighbours: Ints) -> Ints:
 
 @kernel
 def _file(first: Ints, next_one: Ints, before: Ints, degree: Ints, i: int) -> None:
-    """Put a node at the head of the list of its degree."""
+    """Insert a node at the head of the list of its degree."""
     head = first[degree[i]]
     next_one[i], before[i], first[degree[i]] = head, -1, i
     if head >= 0:
@@ -98,7 +98,7 @@ def _file(first: Ints, next_one: Ints, before: Ints, degree: Ints, i: int) -> No
 
 @kernel
 def _take_out(first: Ints, next_one: Ints, before: Ints, degree: Ints, i: int) -> None:
-    """Take a node out of the list of its degree."""
+    """Remove a node from the list of its degree."""
     if before[i] >= 0:
         next_one[before[i]] = next_one[i]
     else:

@@ -1,4 +1,4 @@
-"""Lists that grow inside kernels: an array with room, and how much of it is used."""
+"""Arrays that grow inside kernels."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from diffcloud.compiled import kernel
 
 @kernel
 def with_room(pool, used: int, more: int):  # type: ignore[no-untyped-def]
-    """The pool [capacity, width], or a longer copy where `more` rows do not fit after the `used` ones."""
+    """Return the array [capacity, width], or a longer copy if `more` rows do not fit after the `used` ones."""
     if used + more <= len(pool):
         return pool
     longer = np.empty((max(2 * len(pool), used + more), pool.shape[1]), pool.dtype)

@@ -1,4 +1,4 @@
-"""Orders, found inside kernels."""
+"""Sorting inside kernels."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from diffcloud.sim.compiled.data import Floats, Ints
 
 @kernel
 def ascending(values: Floats) -> Ints:
-    """The order that sorts values; equal ones keep theirs (a merge sort: numba's own takes seconds to compile)."""
+    """Return the indices that sort the values (stable merge sort). Numba's own sort takes seconds to compile."""
     count = len(values)
     order, other = np.arange(count), np.empty(count, np.int64)
     width = 1
@@ -32,7 +32,7 @@ def ascending(values: Floats) -> Ints:
 
 @kernel
 def sort_part(numbers: Ints, begin: int, end: int) -> None:
-    """Sort numbers[begin:end] in place (a shell sort)."""
+    """Sort numbers[begin:end] in place (shell sort)."""
     gap = 1
     while gap < (end - begin) // 3:
         gap = 3 * gap + 1

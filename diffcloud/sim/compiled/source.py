@@ -1,4 +1,4 @@
-"""Straight-line Python code of formulas."""
+"""Generates straight-line Python code from formulas."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ _CALL = {
 
 
 class Code:
-    """Lines of code in which each node is computed once."""
+    """Lines of code that compute each node once."""
 
     def __init__(self) -> None:
         self.lines: list[str] = []
         self._known: dict[int, str] = {}
 
     def compute(self, outputs: Iterable[Scalar]) -> None:
-        """Assign everything that the outputs need and that is not known yet."""
+        """Append assignments for all nodes that the outputs need and that are not computed yet."""
         for node in ordered(outputs):
             if node.number in self._known:
                 continue
@@ -41,7 +41,7 @@ class Code:
             self._known[node.number] = name
 
     def name(self, node: Scalar) -> str:
-        """Of a node that has been computed: a variable or a number."""
+        """Variable name or number of a computed node."""
         return self._known[node.number]
 
     def _expression(self, node: Scalar) -> str:
@@ -63,13 +63,13 @@ class Code:
             case "sign":
                 return f"(1.0 if {names[0]} > 0 else 0.0) - (1.0 if {names[0]} < 0 else 0.0)"
             case "pick":
-                before, after = cast(tuple[str, str], node.payload)  # of `terms.term.Element`
+                before, after = cast(tuple[str, str], node.payload)  # from `terms.term.Element`
                 return f"{before}int({names[0]}){after}"
         raise ValueError(f"No code for {operation}.")
 
 
 def straight_kernel(name: str, arguments: str, body: Iterable[str]) -> str:
-    """The text of a kernel whose body is straight code (`compiled.straight`)."""
+    """Source code of a kernel with a straight-line body (`compiled.straight`)."""
     head = f"@straight\ndef _{name}({arguments}):"
     call = f"@kernel\ndef {name}({arguments}):\n    _{name}({arguments})"
     return "\n".join([head, *(f"    {line}" for line in body), "", call])

@@ -1,13 +1,13 @@
-"""Sparse direct solvers for the matrices of a step: 3 x 3 blocks, one for each pair of nodes that share an element.
+"""Sparse direct solvers for the matrices of a step, in 3 x 3 blocks, one for each pair of nodes that share an element.
 
-Nodes are numbered anew by their *place* in an order that keeps the factors small (minimum degree, as SuperLU finds it). The
-lower half is stored column by column; an element finds its blocks by *slots* that are worked out once. Contact
-between parts of the cloth that share no element adds blocks in single steps. The pattern of the factor is then found
-again, and, where the order no longer suits it, another order (`ordering`).
+Nodes are renumbered: the *place* of a node is its position in an elimination order that keeps the factors small (minimum
+degree, computed by SuperLU). The lower half is stored by columns. The *slots* of an element are the precomputed positions
+of its blocks. Contact between parts of the cloth that share no element adds blocks temporarily. Then the pattern of the
+factor is computed again, and also the order if the factor has grown too much (`ordering`).
 
-Cholesky for ARCSim's step. For the exact Jacobian of the implicit step, which is not symmetric but has a symmetric
-pattern, LU by blocks: the upper half is stored transposed, in the pattern of the lower. It does not exchange rows
-beyond the blocks; `solve_general` looks at what is left over and turns to a dense factor where that has gone wrong.
+ARCSim's step uses Cholesky. The exact Jacobian of the implicit step is not symmetric, but its pattern is. It uses block LU,
+with the upper half stored transposed in the pattern of the lower one. There is no pivoting beyond the blocks.
+`solve_general` checks the residual and falls back to a dense factorisation.
 """
 
 from __future__ import annotations
@@ -28,22 +28,22 @@ from diffcloud.sim.compiled.sorting import sort_part
 
 
 class Pattern(NamedTuple):
-    """Where a symmetric pattern of blocks has entries, and its factor."""
+    """Positions of the blocks of a symmetric matrix, and of its factor."""
 
     place: Ints
-    """[V] of each node in the order of elimination."""
+    """[V] position of each node in the elimination order."""
     starts: Ints
-    """[V + 1] of each column of the lower half in `rows`."""
+    """[V + 1] start of each column of the lower half in `rows`."""
     rows: Ints
     """[A] places, ascending within a column, the diagonal first."""
     factor_starts: Ints
-    """[V + 1]"""
+    """[V + 1] start of each column of the factor in `factor_rows`."""
     factor_rows: Ints
-    """[L]"""
+    """[L] places, as `rows`."""
 
 
 def pattern(node_count: int, groups: Sequence[Ints]) -> Pattern:
-    """The pattern of elements, each group [E, n] of nodes."""
+    """Build the pattern that couples the nodes of each element, from groups of elements [E, n]."""
     first = np.concatenate([np.arange(node_count), *(np.repeat(nodes, nodes.shape[1], axis=1).ravel() for nodes in groups)])
     second = np.concatenate([np.arange(node_count), *(np.tile(nodes, nodes.shape[1]).ravel() for nodes in groups)])
     place = _fill_reducing(node_count, first, second)
@@ -56,7 +56,8 @@ def pattern(node_count: int, groups: Sequence[Ints]) -> Pattern:
 
 
 def slots(of: Pattern, nodes: Ints) -> Ints:
-    """[E, pairs] where the blocks of each pair (a, b >= a) of an element's nodes lie; s, or ~s where it is transposed."""
+    """Position [E, pairs] of the block of each pair (a, b >= a) of an element's nodes: s, or ~s if it is stored
+    transposed."""
     count = len(of.place)
     column_of = np.repeat(np.arange(count), np.diff(of.starts))
     key = column_of * count + of.rows
@@ -67,7 +68,7 @@ def slots(of: Pattern, nodes: Ints) -> Ints:
 
 
 def _fill_reducing(node_count: int, first: Ints, second: Ints) -> Ints:
-    """[V] places by minimum degree."""
+    """Places [V] by minimum degree."""
     graph = csc_matrix(coo_matrix((np.ones(len(first)), (first, second)), shape=(node_count, node_count)))
     graph.data[:] = 1.0
     graph += csc_matrix((np.full(node_count, 2.0 * node_count), (np.arange(node_count),) * 2), shape=graph.shape)
@@ -77,7 +78,7 @@ def _fill_reducing(node_count: int, first: Ints, second: Ints) -> Ints:
 
 @kernel
 def factor_pattern(starts: Ints, rows: Ints) -> tuple[Ints, Ints]:
-    """Starts and rows of the factor: a column takes over the rows of those that it is the first row of."""
+    """Starts and rows of the factor. Each column inherits the rows of the columns whose first off-diagonal row it is."""
     count = len(starts) - 1
     first_child = np.full(count, -1, np.int64)
     next_child = np.full(count, -1, np.int64)
@@ -121,7 +122,7 @@ def factor_pattern(starts: Ints, rows: Ints) -> tuple[Ints, Ints]:
 
 @kernel
 def add_assemble(slots: Ints, blocks: Floats, matrix: Floats) -> None:
-    """Add the symmetric blocks [E, pairs, 9] of elements to a matrix, each to the half that is stored."""
+    """Add the symmetric blocks [E, pairs, 9] of elements to the stored half of a matrix."""
     for e in range(len(slots)):
         for p in range(slots.shape[1]):
             _add_block(slots[e, p], blocks, e, p, matrix, matrix)
@@ -129,7 +130,8 @@ def add_assemble(slots: Ints, blocks: Floats, matrix: Floats) -> None:
 
 @kernel
 def add_jacobian(slots: Ints, blocks: Floats, lower: Floats, upper: Floats) -> None:
-    """The same for blocks [E, n², 9] without symmetry: the upper half is stored transposed, apart."""
+    """Add nonsymmetric blocks [E, n², 9] of elements to the lower half and to the upper half, which is stored
+    transposed."""
     corners = int(sqrt(blocks.shape[1]))
     for e in range(len(slots)):
         p = 0
@@ -162,8 +164,10 @@ def _add_block(slot, blocks, e, p, lower, upper):  # type: ignore[no-untyped-def
 
 @kernel
 def find_slot(of: Pattern, first: int, second: int) -> int:
-    """Where the block (first, second) of two nodes lies, as `slots` says; where the pattern has none, or one of them
-    is no node, the spare place after the last."""
+    """Slot of the block (first, second) of two nodes, as in `slots`.
+
+    Returns the spare slot after the last one if the pattern has no such block, or if a number is not a node.
+    """
     spare = len(of.rows)
     if first >= len(of.place) or second >= len(of.place):
         return spare
@@ -182,7 +186,7 @@ def find_slot(of: Pattern, first: int, second: int) -> int:
 
 @kernel
 def hold(of: Pattern, holder: Ints, mass: Floats, matrix: Floats) -> None:
-    """Let nodes [V] that a handle prescribes (holder >= 0) couple with nothing; their diagonal is their mass."""
+    """Decouple nodes [V] that a handle prescribes (holder >= 0). Their diagonal becomes their mass."""
     free = np.ones(len(of.place), np.bool_)
     any_held = False
     for i in range(len(of.place)):
@@ -202,21 +206,21 @@ def hold(of: Pattern, holder: Ints, mass: Floats, matrix: Floats) -> None:
 
 @kernel
 def widened(of: Pattern, first: Ints, second: Ints, place: Ints) -> tuple[Pattern, Ints]:
-    """A pattern with more pairs of nodes, eliminated in a given order, and where the blocks of the old one lie in it.
+    """Extend a pattern by pairs of nodes, with a given elimination order.
 
     Args:
-        first, second: nodes of the pairs to add; a pair may stand there several times.
-        place: [V] of each node in the order of elimination; `of.place` keeps the old one.
+        first, second: nodes of the added pairs; duplicates are allowed.
+        place: [V] position of each node in the elimination order; `of.place` keeps the old order.
 
     Returns:
-        The pattern, and [A] the place of each old block: s, or ~s where it is transposed.
+        The pattern, and the new position [A] of each old block: s, or ~s if it is stored transposed.
     """
     count, known = len(place), len(of.rows)
     node = np.empty(count, np.int64)
     for i in range(count):
         node[of.place[i]] = i
     row, flipped = np.empty(known + len(first), np.int64), np.zeros(known, np.bool_)
-    last, following = np.full(count, -1, np.int64), np.empty(len(row), np.int64)  # the blocks of each column
+    last, following = np.full(count, -1, np.int64), np.empty(len(row), np.int64)  # linked list of the blocks of each column
     for j in range(count):
         for p in range(of.starts[j], of.starts[j + 1]):
             a, b = place[node[of.rows[p]]], place[node[j]]
@@ -252,7 +256,7 @@ def widened(of: Pattern, first: Ints, second: Ints, place: Ints) -> tuple[Patter
 
 @kernel
 def reordered(of: Pattern) -> Ints:
-    """The place [V] of each node in an order of elimination that suits this pattern, by `minimum_degree`."""
+    """Places [V] of the nodes in a new elimination order for this pattern, by `minimum_degree`."""
     count = len(of.place)
     starts = np.zeros(count + 1, np.int64)
     for j in range(count):
@@ -276,16 +280,13 @@ def reordered(of: Pattern) -> Ints:
 
 @kernel
 def cholesky(of: Pattern, matrix: Floats, factor: Floats) -> bool:
-    """Factor [L, 9] of a matrix [A, 9]; its diagonal blocks hold the inverse of their diagonals. False: not positive
-    definite.
-
-    Column after column: each takes off what the finished columns that reach it contribute (left-looking).
-    """
+    """Cholesky factor [L, 9] of a matrix [A, 9] (left-looking). Return False if the matrix is not positive definite.
+    Diagonal blocks of the factor store the inverses of their own diagonals."""
     count = len(of.place)
     starts, rows = of.factor_starts, of.factor_rows
     work = np.zeros((count, 9))
-    reached = np.empty(count, np.int64)  # of each finished column, its first entry not yet used
-    waiting = np.full(count, -1, np.int64)  # of each row, a finished column that reaches it next
+    reached = np.empty(count, np.int64)  # first unused entry of each finished column
+    waiting = np.full(count, -1, np.int64)  # for each row, the finished columns that contribute to it next
     following = np.empty(count, np.int64)
     for j in range(count):
         for p in range(of.starts[j], of.starts[j + 1]):
@@ -330,7 +331,7 @@ def cholesky(of: Pattern, matrix: Floats, factor: Floats) -> bool:
 
 @kernel
 def _await_next(column, reached, waiting, following, rows, starts):  # type: ignore[no-untyped-def]
-    """Let a finished column wait for its next row."""
+    """Queue a finished column for its next row."""
     reached[column] += 1
     if reached[column] < starts[column + 1]:
         row = rows[reached[column]]
@@ -352,7 +353,7 @@ def _take_off(work, left, right, rows, begin, end):  # type: ignore[no-untyped-d
         w0, w1, w2 = work[i, 0], work[i, 1], work[i, 2]
         w3, w4, w5 = work[i, 3], work[i, 4], work[i, 5]
         w6, w7, w8 = work[i, 6], work[i, 7], work[i, 8]
-        # everything is read before anything is written, so that the compiler may use vectors
+        # All reads come before all writes, so that the compiler can vectorise.
         w0 -= a0 * t0 + a1 * t1 + a2 * t2
         w1 -= a0 * t3 + a1 * t4 + a2 * t5
         w2 -= a0 * t6 + a1 * t7 + a2 * t8
@@ -369,7 +370,7 @@ def _take_off(work, left, right, rows, begin, end):  # type: ignore[no-untyped-d
 
 @kernel
 def solve(of: Pattern, factor: Floats, right: Floats, solution: Floats) -> None:
-    """solution [V, 3] = A⁻¹ right, by a Cholesky factor."""
+    """solution [V, 3] = A⁻¹ right, with a Cholesky factor."""
     count = len(of.place)
     starts, rows = of.factor_starts, of.factor_rows
     work = np.empty((count, 3))

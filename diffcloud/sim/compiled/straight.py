@@ -1,10 +1,11 @@
-"""Generated code to machine code, past most of numba: its passes over tens of thousands of lines of straight-line
-arithmetic take most of a minute, and none of them is needed.
+"""Compiles generated straight-line code to machine code without most of numba.
 
-The code is Python that also runs as Python (`DIFFCLOUD_UNCOMPILED`), of assignments to numbers, additions to array
-elements, and loops. It computes what numba's own compilation of it would, bit for bit: the same operations in the same
-order. The outer loop goes through four elements at once, each in a lane of the processor's vectors; what they write is
-written one element after the other. So an element may not read what another one writes.
+Numba's passes over tens of thousands of lines of arithmetic would take most of a minute, and are not needed for such code.
+
+The code also runs as plain Python (`DIFFCLOUD_UNCOMPILED`). It consists of assignments to numbers, additions to array
+elements, and loops. The results equal those of numba's own compilation bit for bit: the same operations in the same order.
+The outer loop processes four elements at once, one per lane of the processor's vector unit. Results are written for one
+element after the other. So an element must not read what another one writes.
 """
 
 from __future__ import annotations
@@ -28,9 +29,9 @@ from diffcloud.compiled import UNCOMPILED
 F = TypeVar("F", bound=Callable[..., Any])
 
 _LANES = 4
-"""Elements at once. Where a processor's vectors are shorter, LLVM makes several of one."""
+"""Elements processed at once. On processors with shorter vectors, LLVM splits them."""
 _REAL = {ast.Add: "fadd", ast.Sub: "fsub", ast.Mult: "fmul", ast.Div: "fdiv"}
-_WHOLE = {ast.Add: "add", ast.FloorDiv: "sdiv", ast.Mod: "srem"}  # of indices, which are not negative
+_WHOLE = {ast.Add: "add", ast.FloorDiv: "sdiv", ast.Mod: "srem"}  # for indices, which are not negative
 _COMPARE = {ast.Lt: "<", ast.LtE: "<=", ast.Gt: ">", ast.Eq: "=="}
 _OF_LLVM = {"sqrt": "sqrt", "abs": "fabs", "floor": "floor"}
 _OF_NUMBA = {name: getattr(math, name) for name in ("log", "sin", "cos", "atan2")}
@@ -39,10 +40,8 @@ _INTEGER, _DOUBLE = ir.IntType(64), ir.DoubleType()
 
 
 def straight(function: F) -> F:
-    """A function for kernels to call, of arrays, numbers and named tuples of both, whose code keeps to the few forms above.
-
-    Indices are not negative: they do not count from the end.
-    """
+    """Compile a function of arrays, numbers and named tuples for use in kernels. Its code must have only the forms named
+    above. Indices must not be negative; they do not count from the end."""
     if UNCOMPILED:
         return function
     names = list(inspect.signature(function).parameters)
@@ -65,7 +64,7 @@ def straight(function: F) -> F:
 
 
 class _Array(NamedTuple):
-    """An array, taken apart."""
+    """Components of an array."""
 
     kind: Any
     data: Any
@@ -74,15 +73,15 @@ class _Array(NamedTuple):
 
 
 class _Emitter:
-    """Emits statements with a builder. A value is its numba type and its LLVM value: a number, or a vector with one for
-    each lane."""
+    """Emits LLVM code for statements. A value is a pair of its numba type and its LLVM value, which is a number or a vector
+    with one number per lane."""
 
     def __init__(self, context: Any, builder: Any, scope: dict[str, tuple[Any, Any]]) -> None:
         self.context, self.builder, self.scope = context, builder, scope
         self.arrays: dict[str, _Array] = {}
-        """Those that are in use, by their code."""
+        """Arrays in use, by their source code."""
         self.filled: list[Any] = []
-        """Which lanes have an element; nothing outside of the outer loop."""
+        """For each lane, whether it has an element. Empty outside the outer loop."""
 
     def statements(self, body: Sequence[ast.stmt]) -> None:
         for writes, group in groupby(body, _writes):
@@ -113,7 +112,7 @@ class _Emitter:
             first = self._wide(builder.mul(loop.index, _INTEGER(_LANES)))
             places = builder.add(first, ir.Constant(first.type, list(range(_LANES))))
             within = builder.icmp_signed("<", places, self._wide(count))
-            # lanes beyond the last element compute it again, and write nothing
+            # Lanes beyond the last element compute it again, but write nothing.
             places = builder.select(within, places, self._wide(builder.sub(count, _INTEGER(1))))
             self.filled = [_lane(builder, within, lane) for lane in range(_LANES)]
             self.scope[name] = (types.intp, places)
@@ -121,7 +120,7 @@ class _Emitter:
             self.filled = []
 
     def _write(self, body: Sequence[ast.stmt]) -> None:
-        """Stores, and additions to array elements, of one lane after the other."""
+        """Emit stores, and additions to array elements, for one lane after the other."""
         builder = self.builder
         writes = [(self._place(_target(one)), self._number(one.value), one) for one in body]  # type: ignore[attr-defined]
         for lane, filled in enumerate(self.filled or [None]):
@@ -194,7 +193,7 @@ class _Emitter:
         return types.float64, self._joined([called(builder, [_lane(builder, n, lane) for n in numbers]) for lane in lanes])
 
     def _number(self, node: ast.expr) -> Any:
-        """A value as a double."""
+        """A value converted to double."""
         return self._real(*self.value(node))
 
     def _real(self, kind: Any, number: Any) -> Any:
@@ -203,14 +202,14 @@ class _Emitter:
         return self.builder.sitofp(number, ir.VectorType(_DOUBLE, _LANES) if _is_wide(number) else _DOUBLE)
 
     def _both(self, left: ast.expr, right: ast.expr, *, whole: bool) -> tuple[Any, Any, Any]:
-        """Two values of one type: whole numbers where both are and the operation knows them, else doubles."""
+        """Two values of one type: integers if both are and the operation supports them, otherwise doubles."""
         a, b = self.value(left), self.value(right)
         if whole and a[0] == b[0] == types.intp:
             return types.intp, *self._alike(a[1], b[1])
         return types.float64, *self._alike(self._real(*a), self._real(*b))
 
     def _place(self, node: ast.Subscript) -> tuple[_Array, list[Any]]:
-        """An array and the indices of an element."""
+        """Array and indices of an array element."""
         indices = node.slice.elts if isinstance(node.slice, ast.Tuple) else [node.slice]
         name = ast.unparse(node.value)
         if name not in self.arrays:
@@ -221,7 +220,7 @@ class _Emitter:
         return self.arrays[name], [self.value(index)[1] for index in indices]
 
     def _pointer(self, place: tuple[_Array, list[Any]], lane: int) -> Any:
-        """Where one lane's element lies."""
+        """Pointer to the array element of one lane."""
         array, indices = place
         return cgutils.get_item_pointer2(
             self.context,
@@ -234,15 +233,15 @@ class _Emitter:
         )
 
     def _alike(self, *numbers: Any) -> list[Any]:
-        """All as vectors if one is."""
+        """Convert all numbers to vectors if one of them is a vector."""
         return [self._wide(number) for number in numbers] if any(map(_is_wide, numbers)) else list(numbers)
 
     def _wide(self, number: Any) -> Any:
-        """A number in every lane."""
+        """A number repeated in every lane."""
         return number if _is_wide(number) else self._joined([number] * _LANES)
 
     def _joined(self, numbers: Sequence[Any]) -> Any:
-        """A vector of one number for each lane; one number stays itself."""
+        """A vector with one number per lane. A single number is returned unchanged."""
         if len(numbers) == 1:
             return numbers[0]
         found = ir.Constant(ir.VectorType(numbers[0].type, _LANES), ir.Undefined)
@@ -259,7 +258,7 @@ def _writes(statement: ast.stmt) -> bool:
 
 
 def _target(statement: ast.stmt) -> ast.Subscript:
-    """What a writing statement writes."""
+    """Target of a statement that writes to an array."""
     return cast(ast.Subscript, statement.target if isinstance(statement, ast.AugAssign) else statement.targets[0])  # type: ignore[attr-defined]
 
 

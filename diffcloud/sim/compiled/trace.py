@@ -1,9 +1,8 @@
-"""Expressions of numbers that differentiate themselves: a force is written once, as a formula, and everything that a step
-needs of it (its value, its stiffness, its derivatives in both modes) is generated from that.
+"""Symbolic expressions: a force is written once as a formula. Its value, stiffness and derivatives are generated.
 
-A formula is an ordinary Python function of `Scalar` and `Vector`. Calling it builds a graph; equal expressions are
-one node. `compiled.derivatives` makes graphs of derivatives, and `compiled.source` writes graphs as straight-line
-Python code, which numba compiles.
+A formula is an ordinary Python function of `Scalar` and `Vector`. Calling it builds a graph, in which equal expressions are
+one node. `compiled.derivatives` builds graphs of derivatives. `compiled.source` writes graphs as straight-line Python code,
+which numba compiles.
 
 Conditions are values (`where`), not branches: both sides are computed.
 """
@@ -20,13 +19,13 @@ _COMMUTE = {"add", "mul", "eq", "and"}
 
 @dataclass(eq=False)
 class Graph:
-    """All nodes of some formulas."""
+    """All nodes of one or more formulas."""
 
     nodes: list[Scalar] = field(default_factory=list)
     _known: dict[tuple[object, ...], Scalar] = field(default_factory=dict)
 
     def node(self, operation: str, *operands: Scalar, payload: object = None) -> Scalar:
-        """The node of an operation; the same one for the same operation."""
+        """Return the node of an operation, and create it if it does not exist."""
         numbers = [operand.number for operand in operands]
         if operation in _COMMUTE:
             numbers.sort()
@@ -42,7 +41,7 @@ class Graph:
         return self.node("constant", payload=float(value))
 
     def input(self, name: str) -> Scalar:
-        """A number that the code is given: a variable's name, or an array with its indices."""
+        """An input of the code: the name of a variable, or of an array with its indices."""
         return self.node("input", payload=name)
 
     def vector(self, *names: str) -> Vector:
@@ -51,7 +50,7 @@ class Graph:
 
 @dataclass(eq=False, frozen=True, repr=False)
 class Scalar:
-    """One number of a formula. Operators build the graph; comparisons give conditions for `where`."""
+    """A number in a formula. Operators build the graph; comparisons give conditions for `where`."""
 
     graph: Graph
     number: int
@@ -66,11 +65,11 @@ class Scalar:
 
     @property
     def value(self) -> float | None:
-        """Of a constant."""
+        """Value of a constant; None for other nodes."""
         return self.payload if self.operation == "constant" else None  # type: ignore[return-value]
 
     def of(self, other: Scalar | float) -> Scalar:
-        """A number as a node of this graph."""
+        """Convert a number to a node of this graph."""
         return other if isinstance(other, Scalar) else self.graph.constant(other)
 
     def __add__(self, other: Scalar | float) -> Scalar:
@@ -117,7 +116,7 @@ class Scalar:
         return self.of(other) <= self
 
     def equals(self, other: Scalar | float) -> Scalar:
-        """A condition; `==` compares nodes."""
+        """Condition that two numbers are equal. (`==` compares nodes.)"""
         return self.graph.node("eq", self, self.of(other))
 
     def __and__(self, other: Scalar) -> Scalar:
@@ -129,7 +128,7 @@ class Scalar:
 
 @dataclass(frozen=True)
 class Vector:
-    """Three numbers."""
+    """Three numbers in a formula."""
 
     x: Scalar
     y: Scalar
@@ -160,17 +159,17 @@ class Vector:
 
 
 def dot(a: Vector, b: Vector) -> Scalar:
-    """a · b"""
+    """Dot product a · b."""
     return a.x * b.x + a.y * b.y + a.z * b.z
 
 
 def cross(a: Vector, b: Vector) -> Vector:
-    """a × b"""
+    """Cross product a × b."""
     return Vector(a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x)
 
 
 def total(parts: Iterable[Vector]) -> Vector:
-    """The sum of one or more vectors."""
+    """Sum of one or more vectors."""
     first, *rest = parts
     for part in rest:
         first = first + part
@@ -186,7 +185,7 @@ def logarithm(a: Scalar) -> Scalar:
 
 
 def floor(a: Scalar) -> Scalar:
-    """Without derivative."""
+    """Floor of a number, without derivative."""
     return unary("floor", a)
 
 
@@ -195,7 +194,7 @@ def absolute(a: Scalar) -> Scalar:
 
 
 def arctangent(sine: Scalar, cosine: Scalar) -> Scalar:
-    """atan2"""
+    """atan2(sine, cosine)."""
     return sine.graph.node("atan2", sine, cosine)
 
 
@@ -208,43 +207,43 @@ def cosine(a: Scalar) -> Scalar:
 
 
 def where(condition: Scalar, then: Scalar | float, otherwise: Scalar | float) -> Scalar:
-    """`then` where the condition holds, else `otherwise`."""
+    """`then` if the condition holds, otherwise `otherwise`."""
     a, b = condition.of(then), condition.of(otherwise)
     return a if a is b else condition.graph.node("where", condition, a, b)
 
 
 def maximum(a: Scalar, low: Scalar | float) -> Scalar:
-    """At least `low`."""
+    """The larger of a number and a constant."""
     return where(a >= low, a, low)
 
 
 def clamped(a: Scalar, low: float, high: float) -> Scalar:
-    """Between both."""
+    """A number limited to [low, high]."""
     return where(a < low, low, where(a > high, high, a))
 
 
 def minimum(a: Scalar, b: Scalar) -> Scalar:
-    """The smaller one."""
+    """The smaller of two numbers."""
     return a.graph.node("min", a, b)
 
 
 def larger(a: Scalar, b: Scalar) -> Scalar:
-    """The larger one."""
+    """The larger of two numbers."""
     return -minimum(-a, -b)
 
 
 def norm(a: Vector, tiny: float = 1e-30) -> Scalar:
-    """|a|, with the derivative zero instead of infinite at the origin."""
+    """|a|, with zero derivative at the origin instead of an infinite one."""
     return squareroot(maximum(dot(a, a), tiny))
 
 
 def held(a: Scalar) -> Scalar:
-    """The same number, as a constant for derivatives."""
+    """The same number, treated as a constant in derivatives."""
     return a.graph.node("held", a)
 
 
 def ordered(outputs: Iterable[Scalar]) -> list[Scalar]:
-    """All nodes that the outputs need, each after its operands: in the order in which they were made."""
+    """All nodes that the outputs need, each after its operands (in order of creation)."""
     seen: dict[int, Scalar] = {}
     todo = list(outputs)
     while todo:
@@ -299,7 +298,7 @@ def _mul(a: Scalar, b: Scalar) -> Scalar:
         return _neg(_mul(a.operands[0], b))
     if b.operation == "neg":
         return _neg(_mul(a, b.operands[0]))
-    # a slope that counts on one side of a condition only
+    # The other factor is a derivative that is nonzero on one side of a condition only.
     if b.operation == "where" and {b.operands[1].value, b.operands[2].value} == {0.0, 1.0}:
         return where(b.operands[0], _mul(a, b.operands[1]), _mul(a, b.operands[2]))
     return a.graph.node("mul", a, b)

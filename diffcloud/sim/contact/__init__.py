@@ -1,1 +1,2 @@
-"""What any contact needs: everything that can touch, which pairs are near, how far they are, and how far they may go."""
+"""Contact detection and contact forces: contact surfaces, pairs of nearby primitives, distances, and collision-free
+steps."""

@@ -1,8 +1,8 @@
-"""How far points can move along straight lines before a pair touches: additive continuous collision detection.
+"""Additive continuous collision detection: how far points can move along straight lines before a pair touches.
 
-Li et al. 2021 (Codimensional IPC): advance by no more than the distance that is left, divided by the speed bound, until
-the distance falls to a fixed part of what it was. No polynomial is solved, so nothing goes wrong for parallel edges,
-flat motions or zero thickness, and the answer is always on the safe side.
+Method of Li et al. 2021 (Codimensional IPC): advance repeatedly by at most the remaining distance over a bound of the
+speed, until the distance is a fixed fraction of the initial one. No polynomial is solved. So parallel edges, flat motions
+and zero thickness are not special cases, and the result is always conservative.
 """
 
 from __future__ import annotations
@@ -16,31 +16,32 @@ from diffcloud.sim.compiled.data import Floats, Ints
 from diffcloud.sim.contact.distance import closest
 
 _LEFT = 0.2
-"""Part of the starting distance that the first advance leaves; later ones may go down to half of that."""
+"""Fraction of the initial distance that remains after the first advance. Further advances may leave half of this
+fraction."""
 _ENOUGH = 2.0
-"""An advance stops when the distance is less than this many times its goal."""
+"""Stop when the distance is below this multiple of its goal."""
 _ADVANCES = 100
-"""Stopping earlier is safe, only short."""
+"""Maximum number of advances. Stopping early is safe, but shortens the step."""
 
 
 @kernel
 def safe_fraction(pairs: Ints, distances: Floats, start: Floats, end: Floats, limit: float, floor: float) -> float:
-    """The fraction of the motion that keeps at least a tenth of every pair's distance, at most `limit`.
+    """Fraction of the motion, at most `limit`, that keeps at least a tenth of every pair's distance.
 
     Args:
         pairs: [C, 5] kind (1: two edges) and points.
         distances: [C] at the start, or a lower bound [m].
         start, end: [N, 3] positions of all points [m].
-        floor: pairs as close as this may not come closer at all: below, rounding could put them on the wrong side [m].
+        floor: pairs this close may not come closer, because rounding could make them interpenetrate [m].
     """
     x, motion, at, found = np.empty((4, 3)), np.empty((4, 3)), np.empty((4, 3)), np.empty(6)
     ways = path_lengths(start, end)
     for c in range(len(pairs)):
-        # most pairs move so little that they need no look, not even at what their points have in common
+        # Most pairs move so little that this cheap bound is sufficient, which includes their common motion.
         if reach(pairs, c, ways) * limit <= (1 - _LEFT) * distances[c]:
             continue
         bound = approach(pairs, c, start, end, x, motion)
-        # a pair that moves so little that it cannot touch needs no look
+        # This bound excludes the common motion. Pairs that cannot touch are skipped.
         if not bound * limit > (1 - _LEFT) * distances[c]:
             continue
         first = closest(pairs[c, 0], x, found)
@@ -54,7 +55,7 @@ def safe_fraction(pairs: Ints, distances: Floats, start: Floats, end: Floats, li
                     at[k, axis] = x[k, axis] + fraction * motion[k, axis]
             left = closest(pairs[c, 0], at, found)
             if left < _ENOUGH * goal and left <= first:
-                break  # near the goal each advance would be shorter than the last: enough
+                break  # near the goal, further advances would only become shorter
             fraction += 0.9 * (left - goal) / bound
         limit = min(limit, fraction)
     return limit
@@ -62,7 +63,7 @@ def safe_fraction(pairs: Ints, distances: Floats, start: Floats, end: Floats, li
 
 @kernel
 def path_lengths(start: Floats, end: Floats) -> Floats:
-    """[N] how far each point goes from start to end [N, 3] [m]."""
+    """Length [N] of each point's path from start to end [N, 3] [m]."""
     found = np.empty(len(start))
     for i in range(len(start)):
         square = 0.0
@@ -74,7 +75,7 @@ def path_lengths(start: Floats, end: Floats) -> Floats:
 
 @kernel
 def reach(pairs: Ints, c: int, lengths: Floats) -> float:
-    """How much closer pair c [kind, points] can have come when its points have gone so far [m]."""
+    """Upper bound of the approach of pair c [kind, points] if its points have moved by these lengths [m]."""
     i, j, k, l = pairs[c, 1], pairs[c, 2], pairs[c, 3], pairs[c, 4]
     if pairs[c, 0] > 0:
         return max(lengths[i], lengths[j]) + max(lengths[k], lengths[l])
@@ -83,8 +84,8 @@ def reach(pairs: Ints, c: int, lengths: Floats) -> float:
 
 @kernel
 def approach(pairs: Ints, c: int, start: Floats, end: Floats, x: Floats, motion: Floats) -> float:
-    """How fast a pair can come closer [m]; x, motion [4, 3] take where its points start and how they go, without what
-    they have in common."""
+    """Upper bound of the approach of a pair over the motion [m]. `x` and `motion` [4, 3] receive the start of its points
+    and their motion relative to its mean."""
     for axis in range(3):
         mean = 0.0
         for k in range(4):

@@ -1,26 +1,26 @@
-"""Smooth contact: a barrier against touching, and Coulomb friction, both at the end of the step.
+"""Smooth contact: a barrier potential and Coulomb friction, both evaluated at the end of the step.
 
-The potential of one place at distance d below the thickness d̂ is
+The potential of one contact at distance d below the thickness d̂ is
 
-    φ(d) = -(K/6) (d - d̂)² ln(d / d̂),      K = k_c A,
+    φ(d) = -(K/6) (d - d̂)² ln(d / d̂),      K = k_c A.
 
-twice continuously differentiable at d̂, infinite at d = 0 (Li et al. 2020, Incremental Potential Contact), weighted
-by area (Li et al. 2023, Convergent IPC) and scaled so that near d̂ it equals ARCSim's K (d̂ - d)³ / (6 d̂).
+It is twice continuously differentiable at d̂ and infinite at d = 0 (Li et al. 2020, Incremental Potential Contact, IPC). It
+is weighted by the area A (Li et al. 2023, Convergent IPC). Near d̂ it equals ARCSim's potential K (d̂ - d)³ / (6 d̂).
 
-A point near a mesh feels every face within d̂. Where faces meet, the sum would count a place twice; so the shared
-edge is taken off once and an interior point added back once (inclusion and exclusion, as in Convergent IPC), which
-leaves exactly one contact over a flat surface however it is cut into triangles, and is smooth over all features.
-`places` sums what falls on the same point, edge or face beforehand: each is an element with its share of the area,
-which may be negative.
+A point near a mesh is repelled by every face within d̂. Where faces meet, this sum would count a contact twice. So each
+shared edge is subtracted once, and each interior point is added back once (inclusion and exclusion, as in Convergent IPC).
+The result is exactly one contact over a flat surface, for any triangulation, and it is smooth across edges and points.
+`places` merges the contacts with the same point, edge or face. Each one is an element with a share of the area, which can
+be negative.
 
-Two edges that become parallel have no unique closest places; their force fades out with the squared sine of the angle
-(as IPC's mollifier; the fading itself adds no force).
+The closest points of two parallel edges are not unique. So their force fades with the squared sine of the angle, like IPC's
+mollifier. The fading itself adds no force.
 
-Friction: -μ λ f(|v_t|) v_t/|v_t| with λ = -φ'(d), v_t the sliding velocity of the step and f = 2y - y², y =
-|v_t|/v_s, up to the sticking speed v_s and 1 beyond: a resting contact creeps slower than v_s. Normal force, normal
-and sliding all belong to the end of the step (nothing is lagged), so forces are smooth in all inputs.
+Friction is -μ λ f(|v_t|) v_t/|v_t| with λ = -φ'(d) and the sliding velocity v_t of the step. f = 2y - y² with y = |v_t|/v_s
+up to the sticking speed v_s, and 1 above. So a contact at rest creeps slower than v_s. Normal force, normal and sliding
+velocity are all those of the end of the step (no lagging), so forces are smooth in all inputs.
 
-The cautious matrix is in `resistance`.
+`resistance` has the positive semidefinite approximation of the stiffness.
 """
 
 from __future__ import annotations
@@ -34,11 +34,12 @@ _PARALLEL = 1e-3
 """Squared sine of the angle between two edges below which their force fades."""
 
 Place = Callable[[Element], tuple[list[Scalar], Vector, Scalar, Scalar]]
-"""(signed weights of the corners, the vector between the closest places [m], area [m²], coefficient of friction)."""
+"""Function that returns the signed weights of the corners, the vector between the closest points [m], the area [m²] and the
+coefficient of friction."""
 
 
 def _force(place: Place, pair: Element) -> Sequence[Vector]:
-    """Barrier and friction on the corners."""
+    """Barrier force and friction on the corners [N]."""
     weights, gap, share, coefficient = place(pair)
     distance = norm(gap)
     normal = gap / distance
@@ -59,13 +60,13 @@ def _sliding(weights: Sequence[Scalar], normal: Vector, pair: Element) -> Vector
 
 
 def _law(pair: Element, number: int) -> Scalar:
-    """k_c [N/m³], d̂ [m] or v_s [m/s] of pairs, and in the second row of pairs that are near at rest."""
+    """k_c [N/m³], d̂ [m] or v_s [m/s]: first row of the table, or second row for pairs that are close at rest."""
     row = pair.graph.constant(0.0) if "mixed" not in pair.constants else where(pair.constant("mixed") < 0.0, 1.0, 0.0)
     return pair.look_up("law", row, number)
 
 
 def _pressure(pair: Element, distance: Scalar) -> Scalar:
-    """-dφ/dd per area [Pa]."""
+    """Normal force per area, -dφ/dd [Pa]."""
     scale, thickness = _law(pair, 0), _law(pair, 1)
     ratio = distance / thickness
     below = ratio < 1.0
@@ -75,13 +76,13 @@ def _pressure(pair: Element, distance: Scalar) -> Scalar:
 
 
 def _per_speed(pair: Element, speed: Scalar) -> Scalar:
-    """f(|v|)/|v|, finite at rest [s/m]."""
+    """f(|v|)/|v|, finite for v = 0 [s/m]."""
     sticking = _law(pair, 2)
     return where(speed < sticking, (2.0 - speed / sticking) / sticking, 1.0 / speed)
 
 
 def _between(pair: Element, weights: list[Scalar], share: Scalar) -> tuple[list[Scalar], Vector, Scalar, Scalar]:
-    """Of a place between points of meshes."""
+    """Result of `Place` for a contact between points of meshes."""
     gap = total(weight * corner for weight, corner in zip(weights, pair.positions, strict=True))
     mixed = pair.constant("mixed") > 0.0
     return weights, gap, share, where(mixed, pair.parameter("friction"), pair.parameter("self_friction"))
@@ -125,14 +126,14 @@ def _edge_edge(pair: Element) -> tuple[list[Scalar], Vector, Scalar, Scalar]:
 
 
 def _plane(node: Element) -> Sequence[Vector]:
-    """Barrier and friction of a half-space n · x >= offset."""
+    """Barrier force and friction of a half-space n · x >= offset [N]."""
     pressing, sliding = _at_plane(node)
     rubbing = node.parameter("friction") * pressing * _per_speed(node, norm(sliding))
     return [pressing * node.vector("normal") - rubbing * sliding]
 
 
 def _at_plane(node: Element) -> tuple[Scalar, Vector]:
-    """(normal force [N], sliding velocity [m/s])."""
+    """Normal force [N] and sliding velocity [m/s]."""
     normal, velocity = node.vector("normal"), node.after[0]
     distance = dot(node.positions[0], normal) - node.constant("offset")
     return node.constant("share") * _pressure(node, distance), velocity - dot(velocity, normal) * normal
@@ -153,9 +154,11 @@ BARRIER_POINT_POINT = _term("point_point", 2, _point_point)
 BARRIER_POINT_EDGE = _term("point_edge", 3, _point_edge)
 BARRIER_POINT_FACE = _term("point_face", 4, _point_face)
 BARRIER_EDGE_EDGE = _term("edge_edge", 4, _edge_edge, "s", "t")
-"""Constants: area that counts [m²]; 1 where an obstacle takes part, -1 of a pair that is near at rest; of two edges the
-fractions along them at which they are closest, 0 or 1, or below zero where that is between their ends.
-Tables: [2, 3] of the law (`_law`)."""
+"""Constants: area [m²]; 1 if an obstacle takes part, -1 for a pair that is close at rest. For two edges also the fractions
+along them of the closest points: 0 or 1, or negative for points between the ends.
+
+Tables: [2, 3] for `_law`.
+"""
 BARRIER_PLANE = Term(
     "barrier_plane",
     corners=1,

@@ -1,5 +1,6 @@
-"""Which pairs of primitives can touch: those whose axis-aligned boxes overlap, found by sweeping along one axis, or by
-grids, one for each size of box, when there are many.
+"""Broad phase: find the pairs of primitives whose axis-aligned boxes overlap.
+
+A few boxes are swept along one axis. Many boxes are sorted into grids, one for each size of box.
 """
 
 from __future__ import annotations
@@ -17,26 +18,26 @@ from diffcloud.sim.contact.rest import listed_in
 from diffcloud.sim.contact.surface import SurfaceBox
 
 _FEW = 600
-"""Of fewer boxes than these sweeping is the quicker way."""
+"""With fewer boxes than this, sweeping is faster than grids."""
 _SMALLEST = 1e-9
-"""[m] Boxes count as at least so large when the size of cells is chosen."""
+"""Lower bound of the box size when the cell size is chosen [m]."""
 _CELLS = 8
-"""Most cells for each box."""
+"""Maximum number of cells per box."""
 _ROUNDING = 1e-9
 
 
 @kernel
 def candidates(surface: SurfaceBox, places: Floats, others: Floats, margin: float) -> tuple[Ints, Ints]:
-    """Pairs whose boxes come within `margin` of each other [m]: (point-face [C, 3], edge-edge [C, 3]) in no order.
+    """Find the pairs whose boxes come within `margin` of each other [m]: point-face [C, 3], edge-edge [C, 3], unordered.
 
-    Pairs that share a point, that lie on one obstacle, or of which neither can move are left out.
+    Pairs that share a point, that belong to the same obstacle, or that cannot move are omitted.
 
     Args:
-        places, others: [N, 3] positions of all points; a box holds a primitive at both (start and end of a motion).
+        places, others: [N, 3] positions of all points at the start and end of a motion. A box contains a primitive at both.
 
     Returns:
-        Indices into the surface's points and faces, and into its edges (twice): first one that can move. Then 1 for pairs
-        that are near at rest (`rest`), else 0.
+        Two columns of indices into the surface's points and faces, or into its edges, the movable one first. The third
+        column is 1 for pairs that are close at rest (`rest`), else 0.
     """
     points, faces, edges = boxes_of(surface, places, others, margin)
     between = _pool(surface, surface.points.reshape(-1, 1), surface.faces, surface.rest_face_starts, surface.rest_faces)
@@ -48,26 +49,27 @@ def candidates(surface: SurfaceBox, places: Floats, others: Floats, margin: floa
 
 
 class _Pool(NamedTuple):
-    """What pairs are made of."""
+    """Data about the two lists of primitives that form pairs."""
 
     first: Ints
-    """[M, n] points of each primitive that may come first."""
+    """[M, n] points of each first primitive."""
     second: Ints
-    """[N, m]"""
+    """[N, m] points of each second primitive."""
     first_moves: Flags
-    """[M] whether contact can move it."""
+    """[M] whether contact can move the first primitive."""
     second_moves: Flags
-    """[N]"""
+    """[N] whether contact can move the second primitive."""
     owner: Ints
-    """[points]"""
+    """[points] owner of each point, 0 for the cloth."""
     movable: Flags
-    """[owners]"""
+    """[owners] whether contact can move the owner."""
     touches_itself: bool
-    """The cloth."""
+    """Whether the cloth can touch itself."""
     rest_starts: Ints
-    """Of the lists of second primitives that are near each first one of the cloth at rest."""
+    """Starts in `rest` of the list of each first primitive of the cloth: the second primitives that are close to it at
+    rest."""
     rest: Ints
-    """Their members."""
+    """Members of these lists."""
 
 
 @kernel
@@ -88,8 +90,8 @@ def _pool(surface: SurfaceBox, first: Ints, second: Ints, rest_starts: Ints, res
 
 @kernel
 def boxes_of(surface: SurfaceBox, places: Floats, others: Floats, margin: float) -> tuple[Floats, Floats, Floats]:
-    """[P, 6], [F, 6], [E, 6] of points, faces and edges at both places [N, 3]: the lowest, then the highest coordinates.
-    Boxes meet where those of the primitives come within `margin` of each other [m]."""
+    """Boxes of points [P, 6], faces [F, 6] and edges [E, 6] at both positions [N, 3]: lowest, then highest coordinates.
+    Boxes overlap if the boxes of the primitives come within `margin` of each other [m]."""
     return (
         _boxes(places, others, surface.points.reshape(-1, 1), 0.5 * margin),
         _boxes(places, others, surface.faces, 0.5 * margin),
@@ -112,7 +114,7 @@ def _boxes(places: Floats, others: Floats, primitives: Ints, margin: float) -> F
 
 @kernel
 def _swept_between(pool: _Pool, first: Floats, second: Floats) -> Ints:
-    """[C, 3] by sweeping along the axis on which boxes spread most: one of each pair begins within the other."""
+    """Pairs [C, 3] by a sweep along the axis of the largest spread. One box of each pair begins within the other."""
     axis = _widest(second)
     order_a, order_b = ascending(first[:, axis]), ascending(second[:, axis])
     a, b, a_moves, b_moves = first[order_a], second[order_b], pool.first_moves[order_a], pool.second_moves[order_b]
@@ -142,7 +144,7 @@ def _swept_between(pool: _Pool, first: Floats, second: Floats) -> Ints:
 
 @kernel
 def _swept_among(pool: _Pool, boxes: Floats) -> Ints:
-    """[C, 3] of one list of boxes in the same way."""
+    """Pairs [C, 3] within one list of boxes, by the same sweep."""
     axis = _widest(boxes)
     order = ascending(boxes[:, axis])
     a, a_moves = boxes[order], pool.first_moves[order]
@@ -160,7 +162,7 @@ def _swept_among(pool: _Pool, boxes: Floats) -> Ints:
 
 @kernel
 def _widest(boxes: Floats) -> int:
-    """The axis along which boxes [M, 6] spread most."""
+    """Axis along which the boxes [M, 6] have the largest spread."""
     best, axis = -1.0, 0
     for k in range(3):
         low, high = np.inf, -np.inf
@@ -173,10 +175,10 @@ def _widest(boxes: Floats) -> int:
 
 @kernel
 def _in_cells(pool: _Pool, first: Floats, second: Floats) -> Ints:
-    """[C, 3] by grids, one for all second boxes up to the usual size and one for each doubling of it: boxes lie in the cell
-    of their low corner, and another box meets those in the cells from which they can reach it."""
-    same = pool.first.shape[1] == pool.second.shape[1]  # both lists are of edges: each pair once
-    level, levels = np.full(len(second), -1, np.int64), 1  # what is not finite meets nothing
+    """Pairs [C, 3] by grids: one for all second boxes up to the typical size, and one for each doubling of it. A box
+    belongs to the cell of its low corner. Each first box is compared with the cells whose boxes can reach it."""
+    same = pool.first.shape[1] == pool.second.shape[1]  # both lists are edges: report each pair once
+    level, levels = np.full(len(second), -1, np.int64), 1  # boxes that are not finite overlap with nothing
     total, finite = 0.0, 0
     for m in range(len(second)):
         if 0 <= _extent(second, m) < np.inf:
@@ -192,7 +194,7 @@ def _in_cells(pool: _Pool, first: Floats, second: Floats) -> Ints:
     count = 0
     for grid in range(levels):
         cells = _cells(second, level, grid, usual * 2.0**grid * (1 + _ROUNDING))
-        boxes = second[cells.order]  # side by side as they are looked at
+        boxes = second[cells.order]  # copied in this order for fast access
         for i in range(len(first) if len(boxes) > 0 else 0):
             found = with_room(found, count, len(boxes))
             for axis in range(3):
@@ -203,7 +205,7 @@ def _in_cells(pool: _Pool, first: Floats, second: Floats) -> Ints:
             for x in range(begin[0], end[0] if begin[2] < end[2] else begin[0]):
                 for y in range(begin[1], end[1]):
                     row = (x * cells.shape[1] + y) * cells.shape[2]
-                    for p in range(cells.starts[row + begin[2]], cells.starts[row + end[2]]):  # one by one along z
+                    for p in range(cells.starts[row + begin[2]], cells.starts[row + end[2]]):  # contiguous along z
                         if meet(first, i, boxes, p):
                             j = cells.order[p]
                             if (not same or i < j) and (pool.first_moves[i] or pool.second_moves[j]):
@@ -217,21 +219,21 @@ class Cells(NamedTuple):
     origin: Floats
     """[3] low corner of the grid [m]."""
     size: float
-    """Of a cell [m]."""
+    """Edge length of a cell [m]."""
     reach: float
-    """No box is larger [m]."""
+    """Upper bound of the size of the boxes [m]."""
     shape: Ints
-    """[3] cells along each axis; they are numbered along z first."""
+    """[3] number of cells along each axis; z varies fastest."""
     starts: Ints
-    """[cells + 1] of each cell in `order`."""
+    """[cells + 1] start of each cell in `order`."""
     order: Ints
-    """Boxes, cell after cell."""
+    """Indices of the boxes, sorted by cell."""
 
 
 @kernel
 def _cells(boxes: Floats, level: Ints, grid: int, reach: float) -> Cells:
-    """A grid for those of the boxes [M, 6] that have its level, none larger than `reach` [m]: with cells of half that size,
-    or larger where that would be too many."""
+    """Build the grid of the boxes [M, 6] of one level, none larger than `reach` [m]. Cells have half this size, or more if
+    there would be too many."""
     taken = 0
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
     for m in range(len(boxes)):
@@ -261,7 +263,7 @@ def _cells(boxes: Floats, level: Ints, grid: int, reach: float) -> Cells:
     total_before = 0
     for cell in range(len(starts)):
         total_before += starts[cell]
-        starts[cell] = total_before  # the end of each cell; filling from the back makes it the start
+        starts[cell] = total_before  # end of each cell; filling from the back turns it into the start
     for m in range(len(boxes) - 1, -1, -1):
         if level[m] == grid:
             starts[place[m]] -= 1
@@ -276,8 +278,8 @@ def _extent(boxes: Floats, m: int) -> float:
 
 @kernel
 def meet(a: Floats, i: int, b: Floats, j: int) -> bool:
-    """Whether two boxes of lists [., 6] have a place in common."""
-    return (  # not `and`, which would branch six times
+    """Whether two boxes of lists [., 6] overlap."""
+    return (  # `and` would branch six times
         (a[i, 0] <= b[j, 3])
         & (b[j, 0] <= a[i, 3])
         & (a[i, 1] <= b[j, 4])
@@ -289,7 +291,8 @@ def meet(a: Floats, i: int, b: Floats, j: int) -> bool:
 
 @kernel
 def _note(pool: _Pool, found: Ints, count: int, a: int, b: int) -> int:
-    """Add a pair whose boxes meet to a list with room, if contact can bring its primitives together; its length then."""
+    """Append a pair of overlapping boxes, if contact between its primitives is possible. Return the new length of the
+    list."""
     first, second, owner = pool.first, pool.second, pool.owner
     owner_a, owner_b = owner[first[a, 0]], owner[second[b, 0]]
     if owner_a == owner_b and (owner_a > 0 or not pool.touches_itself):
@@ -310,7 +313,7 @@ def _note(pool: _Pool, found: Ints, count: int, a: int, b: int) -> int:
 
 @kernel
 def corners_of(surface: SurfaceBox, edges: int, a: int, b: int) -> tuple[int, int, int, int]:
-    """The four points of a pair."""
+    """Indices of the four points of a pair."""
     if edges:
         return surface.edges[a, 0], surface.edges[a, 1], surface.edges[b, 0], surface.edges[b, 1]
     return surface.points[a], surface.faces[b, 0], surface.faces[b, 1], surface.faces[b, 2]

@@ -40,7 +40,7 @@ def on_segment(x: Floats, p: int, a: int, b: int) -> tuple[float, float, float]:
     """Find the point on segment ab that is closest to p.
 
     Returns:
-        (its fraction along ab, clamped to [0, 1]; the same fraction without clamping; its squared distance from p [m²]).
+        Its fraction along ab, clamped to [0, 1]; the fraction without clamping; its squared distance from p [m²].
     """
     along = arm = 0.0
     for axis in range(3):

@@ -10,7 +10,7 @@ from diffcloud.sim.surrounding import Surrounding
 
 
 def half_spaces(mesh: ClothMesh, surrounding: Surrounding) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Planar obstacles n · x >= offset as (normals [P, 3], offsets [P] [m]), on the side where most of the cloth starts."""
+    """Planar obstacles n · x >= offset: normals [P, 3] and offsets [P] [m], on the side where most of the cloth starts."""
     found = [obstacle.plane() for obstacle in surrounding.obstacles]
     planes = [plane for plane in found if plane is not None]
     normals = np.array([normal for normal, _ in planes]).reshape(-1, 3)

@@ -20,23 +20,23 @@ from diffcloud.sim.implicit.terms import kernels
 
 POINT_POINT, POINT_EDGE, POINT_FACE, EDGE_EDGE, PLANE = range(5)
 _VANISHING = 1e-12
-"""Part of what was added and taken off below which a share is rounding."""
+"""Area shares below this fraction of the summed magnitudes are rounding errors."""
 
 _PointPoint, _PointEdge = kernels.BarrierPointPoint, kernels.BarrierPointEdge
 _PointFace, _EdgeEdge, _Plane = kernels.BarrierPointFace, kernels.BarrierEdgeEdge, kernels.BarrierPlane
 
 
 class Planes(NamedTuple):
-    """Half-spaces n · x >= offset, and the points that meet them."""
+    """Half-spaces n · x >= offset, and the points that can touch them."""
 
     normals: Floats
-    """[P, 3] unit."""
+    """[P, 3] unit normals."""
     offsets: Floats
-    """[P] [m]"""
+    """[P] offsets [m]."""
     points: Ints
-    """[Q]"""
+    """[Q] indices of the points."""
     areas: Floats
-    """[Q] [m²]"""
+    """[Q] area of each point [m²]."""
 
 
 class TouchingType(BoxType):  # type: ignore[misc]
@@ -54,20 +54,21 @@ define(Touching, TouchingType, ["point_point", "point_edge", "point_face", "edge
 def places(
     surface: SurfaceBox, planes: Planes, law: Floats, pairs: Ints, distances: Floats, points: Floats, holder: Ints
 ) -> tuple[Ints, Floats]:
-    """The places nearer than the thickness, at points [N, 3].
+    """Find the contacts below the thickness, for points [N, 3].
 
     Args:
-        law: [2, 3] with the thickness in the second column, of pairs that are near at rest in the second row [m].
-        pairs: [C, 8] kind (1: two edges), points, primitives, and 1 if near at rest.
-        distances: [C] [m].
-        holder: [V] of the cloth's nodes; not negative of a prescribed one. These go through half-spaces, where the barrier
-            has no value; no force on them counts.
+        law: [2, 3] contact parameters, with the thickness in the second column [m]. The second row is for pairs close at
+            rest.
+        pairs: [C, 8] kind (1: two edges), points, primitives, and 1 if close at rest.
+        distances: [C] distances of the pairs [m].
+        holder: [V] not negative for prescribed nodes. They can pass through half-spaces, where the barrier is undefined,
+            and forces on them have no effect.
 
     Returns:
-        (kind and points [E, 5], of a plane its number in the place of the second point; area [m²], 1 if an obstacle
-        takes part and -1 if the pair is near at rest, and where along two edges, or of points the area before anything is
-        taken off [E, 4]).
-        Places whose area vanishes are listed too, for the cautious matrix; they are no elements.
+        Kind and points [E, 5]; for a half-space its index replaces the second point. Numbers [E, 4]: the area [m²]; 1 if an
+        obstacle takes part, -1 if the pair is close at rest; then for two edges the fractions along them, for points
+        the area before subtraction [m²]. Contacts with zero area are listed for the cautious matrix, but are not
+        elements.
     """
     room = len(planes.points) * len(planes.offsets)
     for c in range(len(pairs)):
@@ -95,7 +96,7 @@ def places(
             numbers[count, 0], numbers[count, 1], numbers[count, 2], numbers[count, 3] = area, mixed, found[4], found[5]
             count += 1
         else:
-            # one area for all faces of an owner: what is counted twice is then taken off exactly
+            # With one area for all faces of an owner, double counting cancels exactly.
             area = min(surface.point_area[pairs[c, 5]], surface.typical_face_area[surface.owner[second]])
             count = _point_face(
                 surface, pairs, c, area, mixed, thickness, x, int(found[4]), listed, numbers, last, previous, count
@@ -105,7 +106,7 @@ def places(
         if listed[e, 0] != EDGE_EDGE:
             if abs(numbers[e, 0]) < _VANISHING * numbers[e, 2]:
                 numbers[e, 0] = 0.0
-            numbers[e, 2] = 0.5 * (numbers[e, 0] + numbers[e, 2])  # what was added only
+            numbers[e, 2] = 0.5 * (numbers[e, 0] + numbers[e, 2])  # sum of the added areas only
             if numbers[e, 2] == 0 and numbers[e, 0] == 0:
                 continue
         for k in range(5):
@@ -184,14 +185,14 @@ def _point_face(  # type: ignore[no-untyped-def]
 
 @kernel
 def corners(listed: Ints, e: int) -> int:
-    """How many points a place has."""
+    """Number of points of a contact."""
     kind = listed[e, 0]
     return 1 if kind == PLANE else (4 if kind == EDGE_EDGE else kind + 2)
 
 
 @kernel
 def as_elements(planes: Planes, law: Floats, listed: Ints, numbers: Floats):  # type: ignore[no-untyped-def]
-    """Places as elements (`Touching`); law [2, 3] k_c, d̂ and v_s."""
+    """Convert contacts to elements (`Touching`), with law [2, 3]: k_c, d̂ and v_s."""
     none = np.empty((0, 0), np.int64)
     n0, _, c0 = _of_kind(listed, numbers, POINT_POINT, 2)
     n1, _, c1 = _of_kind(listed, numbers, POINT_EDGE, 3)
@@ -214,7 +215,7 @@ def as_elements(planes: Planes, law: Floats, listed: Ints, numbers: Floats):  # 
 
 @kernel
 def _of_kind(listed: Ints, numbers: Floats, kind: int, width: int) -> tuple[Ints, Ints, Floats]:
-    """(points [E, width], second column [E], numbers [4, E]) of the places of one kind."""
+    """Points [E, width], second column [E] and numbers [4, E] of the contacts of one kind."""
     count = 0
     for e in range(len(listed)):
         if listed[e, 0] == kind and numbers[e, 0] != 0:

@@ -1,5 +1,4 @@
-"""What of the contact forces resists motion, with places and normals held: positive semidefinite stiffness for
-cautious steps."""
+"""Positive semidefinite contact stiffness for cautious Newton steps, with contact points and normals held constant."""
 
 from __future__ import annotations
 
@@ -11,7 +10,7 @@ from diffcloud.sim.contact.distance import closest, on_segment
 from diffcloud.sim.contact.places import EDGE_EDGE, PLANE, POINT_EDGE, POINT_POINT, Planes, corners
 
 _PARALLEL = 1e-3
-"""As in `barrier`."""
+"""Same as in `barrier`."""
 _TINY = 1e-30
 
 
@@ -29,17 +28,18 @@ def resistance(
     found: Floats,
     local: Floats,
 ) -> bool:
-    """The stiffness w_a w_b S of place e: that of the barrier into local[:9] [N/m], of friction into local[9:18]
-    [N·s/m]; found [6] takes the weights. False: it resists nothing.
+    """Compute the stiffness w_a w_b S of contact e. Return False if it is zero.
 
     Args:
-        friction: coefficients of obstacles and of the cloth with itself.
+        friction: coefficients of the cloth with obstacles and with itself.
         points, velocities: [N, 3] [m], [m/s].
-        listed, numbers: of `places`.
-        x: [4, 3] room.
+        listed, numbers: results of `places`.
+        x: [4, 3] scratch space.
+        found: [6] receives the weights w.
+        local: [18] receives S of the barrier [N/m], then S of friction [N·s/m].
     """
     kind, count = listed[e, 0], corners(listed, e)
-    share = numbers[e, 0] if kind == EDGE_EDGE else numbers[e, 2]  # negative ones do not count
+    share = numbers[e, 0] if kind == EDGE_EDGE else numbers[e, 2]  # negative shares are ignored
     if not share > 0:
         return False
     for k in range(count):
@@ -91,7 +91,7 @@ def resistance(
 
 @kernel
 def _faded(x: Floats) -> float:
-    """What is left of the share of two edges x [4, 3] that are almost parallel."""
+    """Factor by which the force of two almost parallel edges x [4, 3] fades."""
     u0, u1, u2 = x[1, 0] - x[0, 0], x[1, 1] - x[0, 1], x[1, 2] - x[0, 2]
     v0, v1, v2 = x[3, 0] - x[2, 0], x[3, 1] - x[2, 1], x[3, 2] - x[2, 2]
     a, b, c = u1 * v2 - u2 * v1, u2 * v0 - u0 * v2, u0 * v1 - u1 * v0

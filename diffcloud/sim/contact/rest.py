@@ -1,14 +1,14 @@
-"""Pairs of a cloth's primitives that are near each other in its rest shape, for which contact is thinner.
+"""Pairs of a cloth's primitives that are close to each other in its rest shape. They have a smaller contact thickness.
 
-Contact keeps layers of a cloth apart. Parts of one layer that are nearer than the thickness at rest are no layers: a
-barrier between them would push a flat cloth apart, the more the finer its mesh. The tightest bend that contact allows is
-a half circle with the thickness as its diameter, so parts that are nearer on the cloth than half of its circumference
-cannot meet as layers. Their thickness is a part of the mesh's smallest height, which no two of them are nearer than at
-rest: they do not repel each other there, and do not pass through each other in a sharp crease.
+Contact keeps the layers of a cloth apart. Parts of one layer that are closer than the thickness at rest are not two layers:
+a barrier between them would push a flat cloth apart, more so with a finer mesh. The tightest fold that contact allows is a
+half circle with the thickness as its diameter. So parts whose distance along the cloth is less than this half circumference
+cannot meet as layers. Their thickness is a fraction of the mesh's smallest height, which bounds their distance at rest. So
+they do not repel each other at rest, but cannot pass through each other in a sharp crease.
 
-Distances are measured along the cloth, as the lengths of paths over its faces in material space, so charts, seams and
-the shape in which the cloth starts do not matter. Paths go through nodes and the middles of edges, straight over each
-face (Lanthier, Maheshwari and Sack 1997): they are longer than the shortest ones by a few per cent.
+Distances are lengths of paths over the faces in material space. So they do not depend on charts, seams or the initial
+shape. Paths go through nodes and midpoints of edges, and straight across each face (Lanthier, Maheshwari and Sack 1997).
+They are a few per cent longer than the shortest paths.
 """
 
 from __future__ import annotations
@@ -24,38 +24,38 @@ from diffcloud.sim.compiled.data import Floats, Ints
 from diffcloud.sim.compiled.pool import with_room
 
 CREASE = np.pi / 2
-"""Distance on the cloth, in thicknesses, below which two of its parts cannot meet as layers: half a circumference."""
+"""Distance along the cloth, in thicknesses, below which two parts cannot meet as layers: half a circumference."""
 NEAR_PART = 0.5
-"""Thickness between them, as a part of the mesh's smallest height: below 1 no force acts at rest, and half leaves the cloth
-room to be compressed."""
+"""Contact thickness of these pairs as a fraction of the mesh's smallest height. Below 1 there is no force at rest. One half
+leaves room for compression."""
 
 
 class Lists(NamedTuple):
-    """One list of primitives for each of others, end to end."""
+    """A list of primitives for each of n other primitives, concatenated."""
 
     starts: Ints
-    """[n + 1] where each list starts; the last number is where the last one ends."""
+    """[n + 1] start of each list; the last entry is the end of the last list."""
     members: Ints
-    """Primitives, ascending in each list."""
+    """Indices of primitives, ascending in each list."""
 
 
 class RestPairs(NamedTuple):
-    """Pairs that are near at rest; those that share a node are among them."""
+    """Pairs that are close at rest, including those that share a node."""
 
     faces: Lists
-    """Of each node."""
+    """Close faces of each node."""
     edges: Lists
-    """Of each edge: those with a larger number."""
+    """Close edges of each edge, those with a larger index only."""
 
 
 def near_at_rest(mesh: ClothMesh, distance: float) -> RestPairs:
-    """Return the pairs of nodes and faces, and of edges, that are less than a distance apart on the cloth [m]."""
+    """Find the node-face and edge-edge pairs whose distance along the cloth is below `distance` [m]."""
     edges, _ = mesh.edges
     if distance <= mesh.smallest_height:
         return RestPairs(_empty(len(mesh.nodes)), _empty(len(edges)))
     nodes, faces = len(mesh.nodes), mesh.faces
     middles = nodes + _edge_numbers(edges, faces, nodes)
-    points = np.concatenate([faces, middles], axis=1)  # [F, 6]: corners, then the middles of 01, 12, 20
+    points = np.concatenate([faces, middles], axis=1)  # [F, 6]: corners, then the midpoints of 01, 12, 20
     corner = mesh.verts[mesh.face_verts]
     places = np.concatenate([corner, 0.5 * (corner + np.roll(corner, -1, axis=1))], axis=1)
     i, j = np.array(list(combinations(range(6), 2))).T
@@ -78,7 +78,7 @@ def _empty(count: int) -> Lists:
 
 
 def _edge_numbers(edges: Ints, faces: Ints, nodes: int) -> Ints:
-    """[F, 3] the numbers of the edges 01, 12, 20 of each face."""
+    """Indices [F, 3] of the edges 01, 12, 20 of each face."""
     keys = np.sort(edges, axis=1) @ (nodes, 1)
     order = np.argsort(keys)
     asked = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]], axis=2) @ (nodes, 1)
@@ -86,7 +86,7 @@ def _edge_numbers(edges: Ints, faces: Ints, nodes: int) -> Ints:
 
 
 def _lists(pairs: Ints, count: int, values: Floats | None = None) -> tuple[Lists, Floats]:
-    """The second numbers of pairs [n, 2] as one list for each first number, and the values in that order."""
+    """Group pairs [n, 2] by their first number. Return the lists of second numbers, and the values in the same order."""
     order = np.lexsort(pairs.T[::-1])
     starts = np.concatenate([[0], np.cumsum(np.bincount(pairs[:, 0], minlength=count))])
     return Lists(starts, np.ascontiguousarray(pairs[order, 1])), np.empty(0) if values is None else values[order]
@@ -96,11 +96,11 @@ def _lists(pairs: Ints, count: int, values: Floats | None = None) -> tuple[Lists
 def _reached(
     sources: Ints, starts: Ints, links: Ints, lengths: Floats, touching_starts: Ints, touching: Ints, distance: float
 ) -> Ints:
-    """Pairs [n, 2] of a row of sources [N, k] and what touches points that are less than a distance from them.
+    """For each row of sources [N, k], find everything that touches a point closer than `distance`. Return pairs [n, 2].
 
     Args:
-        starts, links, lengths: `Lists` of the points that each point is linked to, and how long the links are [m].
-        touching_starts, touching: `Lists` of what touches each point.
+        starts, links, lengths: `Lists` of the neighbours of each point, and the lengths of these links [m].
+        touching_starts, touching: `Lists` of the primitives that touch each point.
     """
     best, queue = np.full(len(starts) - 1, np.inf), np.empty((64, 1), np.int64)
     seen = np.full(touching.max() + 1, -1, np.int64)
@@ -111,7 +111,7 @@ def _reached(
             best[sources[n, k]] = 0.0
             queue[tail, 0] = sources[n, k]
             tail += 1
-        while head < tail:  # a point may stand in the queue several times: each time it has come nearer
+        while head < tail:  # a point is queued again each time its distance decreases
             i = queue[head, 0]
             head += 1
             for e in range(starts[i], starts[i + 1]):
@@ -137,7 +137,7 @@ def _reached(
 
 @kernel
 def listed_in(starts: Ints, members: Ints, n: int, one: int) -> bool:
-    """Whether a primitive is in list n of `Lists`."""
+    """Whether primitive `one` is in list n of `Lists`."""
     low, high = starts[n], starts[n + 1]
     while low < high:
         middle = (low + high) // 2

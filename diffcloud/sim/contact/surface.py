@@ -1,10 +1,10 @@
-"""Everything that can touch: points, edges and faces of the cloth and of all obstacles, in one numbering of points.
+"""Contact surface: points, edges and faces of the cloth and of all obstacles, with one numbering of points.
 
-Points 0..V-1 are the cloth's nodes; those of the obstacles follow, obstacle by obstacle. An *owner* is 0 for the cloth
-(one mesh may hold several cloths) and 1, 2, ... for the obstacles.
+Points 0..V-1 are the cloth's nodes, followed by those of each obstacle. The *owner* of a primitive is 0 for the cloth (one
+mesh can contain several cloths) and 1, 2, ... for the obstacles.
 
-Edges and points of an obstacle where the surface is flat or concave are left out by default: nothing straight can meet
-them before it meets a face, a point or another edge.
+By default, flat and concave edges and points of obstacles are omitted: any straight primitive meets a face, a point or
+another edge first.
 """
 
 from __future__ import annotations
@@ -22,50 +22,50 @@ from diffcloud.sim.compiled.data import Floats, Ints
 from diffcloud.sim.contact.rest import near_at_rest
 
 _FLAT = 1e-6
-"""Sine of the dihedral angle below which an obstacle's edge counts as flat."""
+"""An obstacle's edge is flat if the sine of its dihedral angle is below this value."""
 
 
 class Surface(NamedTuple):
     """Points, edges and faces that can touch."""
 
     cloth_points: int
-    """V"""
+    """Number V of cloth nodes."""
     point_count: int
-    """N = V + points of all obstacles."""
+    """Number N of points: V plus the points of all obstacles."""
     points: Ints
-    """[P] points that take part in point-face pairs."""
+    """[P] indices of the points that take part in point-face pairs."""
     edges: Ints
-    """[E, 2] points."""
+    """[E, 2] points of each edge."""
     edge_faces: Ints
-    """[E, 2] the face on each side of an edge (`ClothMesh.edges`), -1 where none."""
+    """[E, 2] the face on each side of an edge (`ClothMesh.edges`); -1 if there is none."""
     faces: Ints
-    """[F, 3] points."""
+    """[F, 3] points of each face."""
     owner: Ints
-    """[N] of each point."""
+    """[N] owner of each point."""
     point_area: Floats
-    """[P] a third of the area of the faces around [m²]; the cloth's in material space, as everywhere."""
+    """[P] a third of the area of the adjacent faces [m²]. Areas of the cloth are in material space."""
     edge_area: Floats
-    """[E] [m²]"""
+    """[E] a third of the area of the adjacent faces [m²]."""
     face_area: Floats
-    """[F] [m²]"""
+    """[F] area of each face [m²]."""
     typical_face_area: Floats
-    """[owners] mean over the faces of each [m²]."""
+    """[owners] mean area of an owner's faces [m²]."""
     edge_share: Floats
-    """[F, 3] what each face takes off for its edges 01, 12, 20: a half where two faces meet (see `barrier`)."""
+    """[F, 3] fraction that each face subtracts for its edges 01, 12, 20: 1/2 if two faces meet there (see `barrier`)."""
     corner_share: Floats
-    """[F, 3] what each face adds for its corners: one over the faces around an inner point."""
+    """[F, 3] fraction that each face adds for its corners: 1 / (number of adjacent faces) at an inner point."""
     movable: NDArray[np.bool_]
-    """[owners]: the cloth, and bodies that contact can move."""
+    """[owners] True for the cloth and for bodies that contact can move."""
     touches_itself: bool
-    """Whether the cloth's own parts are paired with each other."""
+    """Whether contact of the cloth with itself is detected."""
     rest_faces: Ints
-    """Faces that are near each node of the cloth at rest (`rest.Lists.members`)."""
+    """Faces that are close to each cloth node at rest (`rest.Lists.members`)."""
     rest_face_starts: Ints
-    """[V + 1]"""
+    """[V + 1] starts of the lists in `rest_faces`."""
     rest_edges: Ints
-    """Edges that are near each edge of the cloth at rest, those with a larger number."""
+    """Edges that are close to each cloth edge at rest, those with a larger index only."""
     rest_edge_starts: Ints
-    """[edges of the cloth + 1]"""
+    """[edges of the cloth + 1] starts of the lists in `rest_edges`."""
 
 
 class SurfaceBoxType(BoxType):  # type: ignore[misc]
@@ -81,7 +81,7 @@ define(SurfaceBox, SurfaceBoxType, Surface._fields)
 
 @kernel
 def boxed(surface: Surface) -> SurfaceBox:
-    """The surface as kernels pass it on."""
+    """Convert the surface to a box for kernels."""
     return SurfaceBox(
         surface.cloth_points,
         surface.point_count,
@@ -114,14 +114,14 @@ def contact_surface(
     touches_itself: bool = True,
     near_at_rest_below: float = 0.0,
 ) -> Surface:
-    """Join a cloth and its obstacles.
+    """Join a cloth and its obstacles to one contact surface.
 
     Args:
-        near_at_rest_below: primitives of the cloth that are nearer than this at rest, measured on the cloth, are listed as
-            near [m].
-        movable: of each obstacle; default none.
-        touches_itself: whether the cloth's own parts are paired with each other.
+        movable: whether contact can move each obstacle; default none.
         all_edges: keep the flat and concave edges and points of obstacles, as ARCSim does.
+        touches_itself: whether contact of the cloth with itself is detected.
+        near_at_rest_below: list pairs of cloth primitives as close at rest if their distance along the cloth is below this
+            [m].
     """
     movable = [False] * len(obstacles) if movable is None else list(movable)
     points = [np.arange(len(cloth.nodes))]
@@ -181,16 +181,14 @@ def contact_surface(
 
 
 def _spread(edge_faces: NDArray[np.int64], face_area: NDArray[np.float64]) -> NDArray[np.float64]:
-    """[E] a third of the area of the faces at each edge; a missing face (-1) has none."""
+    """Area of each edge [E]: a third of the area of the adjacent faces; a missing face (-1) has none."""
     padded = np.append(face_area, 0.0)
     return np.asarray(padded[edge_faces].sum(axis=1) / 3)
 
 
 def _shares(faces: NDArray[np.int64], point_count: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return (`Surface.edge_share` [F, 3], `Surface.corner_share` [F, 3]) of a mesh.
-
-    The share is 1/2 at an inner edge, 1 / (number of faces around the point) at an inner point, and zero at the boundary.
-    """
+    """Return (`Surface.edge_share` [F, 3], `Surface.corner_share` [F, 3]) of a mesh. The share is 1/2 at an inner edge,
+    1 / (number of faces around the point) at an inner point, and zero at the boundary."""
     half = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]], axis=2).reshape(-1, 2)
     edges, inverse, count = np.unique(half, axis=0, return_inverse=True, return_counts=True)
     inner_edge = (count == 2)[inverse.ravel()].reshape(-1, 3)
@@ -201,7 +199,7 @@ def _shares(faces: NDArray[np.int64], point_count: int) -> tuple[NDArray[np.floa
 
 
 def _sharp_edges(mesh: SurfaceMesh) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """(edges [E, 2], faces [E, 2] with -1 where none) of an obstacle that are convex, or border one face only."""
+    """Edges [E, 2] of an obstacle that are convex or border one face only, and their faces [E, 2], -1 if there is none."""
     half = mesh.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
     face = np.repeat(np.arange(len(mesh.faces)), 3)
     edges, inverse, count = np.unique(np.sort(half, axis=1), axis=0, return_inverse=True, return_counts=True)
@@ -215,10 +213,10 @@ def _sharp_edges(mesh: SurfaceMesh) -> tuple[NDArray[np.int64], NDArray[np.int64
     corner = mesh.nodes[mesh.faces]
     normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)
-    opposite = mesh.faces[sides[:, 1]].sum(axis=1) - edges.sum(axis=1)  # meaningless where unpaired
+    opposite = mesh.faces[sides[:, 1]].sum(axis=1) - edges.sum(axis=1)  # meaningless for edges with one face
     arm = mesh.nodes[np.where(paired, opposite, 0)] - mesh.nodes[edges[:, 0]]
     height = np.einsum("ij,ij->i", arm, normal[sides[:, 0]]) / np.maximum(np.linalg.norm(arm, axis=1), 1e-300)
-    same_way = np.zeros(len(edges), dtype=bool)  # inconsistent orientation tells nothing about convexity: keep
+    same_way = np.zeros(len(edges), dtype=bool)  # convexity is unknown with inconsistent orientation, so the edge is kept
     pair = order[first[paired]], order[first[paired] + 1]
     same_way[paired] = half[pair[0], 0] == half[pair[1], 0]
     keep = ~paired | same_way | (height < -_FLAT)

@@ -1,4 +1,4 @@
-"""Derivatives of an episode of implicit steps in reverse: one transposed solve for each part of a step."""
+"""Reverse-mode derivatives of an episode of implicit steps: one transposed solve for each part of a step."""
 
 from __future__ import annotations
 
@@ -37,22 +37,22 @@ def reverse(
     parameter_gradients: Parameters,
     track_gradients: Floats,
 ) -> None:
-    """Sweep gradients backwards through an episode that `step.simulate` kept.
+    """Propagate gradients backwards through an episode that `step.simulate` kept.
 
     Args:
-        track, obstacles, anchors, positions, velocities, bodies: as `simulate` took and left them.
-        position_gradients, velocity_gradients, body_gradients: [S + 1, V, 3], [S + 1, V, 3], [S + 1, B, 18] of a loss
-            by each step's outcome; the first rows take those by the start.
-        parameter_gradients: zeros, takes the sums.
-        track_gradients: [S, G, 3] zeros, takes those by the track.
+        track, obstacles, anchors, positions, velocities, bodies: as passed to and filled by `simulate`.
+        position_gradients, velocity_gradients, body_gradients: [S + 1, V, 3], [S + 1, V, 3], [S + 1, B, 18] gradients of a
+            loss with respect to the state after each step. The first rows receive the gradients of the initial state.
+        parameter_gradients: zeros; receives the sums over all steps.
+        track_gradients: [S, G, 3] zeros; receives the gradients of the track.
     """
     steps, nodes, count = len(positions) - 1, positions.shape[1], bodies.shape[1]
     work, points = new_work(scene, parameters, nodes, count), scene.surface.point_count
-    speeds = np.empty((points, 3))  # gradients by the velocities before and after a step are one array
+    speeds = np.empty((points, 3))  # one array: the gradients of the velocities before and after a step
     slopes = Motion(np.empty((points, 3)), speeds, speeds, np.empty((points, 3)))
     anchor_gradients, target = np.zeros((len(held.node), 3)), np.empty((len(held.node), 3))
     x, v, own = np.empty((nodes, 3)), np.empty((nodes, 3)), np.empty((count, BODY))
-    early_x, early_v = np.zeros((nodes, 3)), np.zeros((nodes, 3))  # by the start of a part, through the part after it
+    early_x, early_v = np.zeros((nodes, 3)), np.zeros((nodes, 3))  # gradients of a part's start, through the part after it
     for step in range(steps - 1, -1, -1):
         aim(held, track, step, anchors, parameters)
         holder = work.holder = holders(held, step, nodes)
@@ -105,8 +105,13 @@ def _part(
     gradients: Parameters,
     wanted: Floats,
 ) -> None:
-    """Gradients by the end of a part (x, v [V, 3], own [B, 18]) become those by what it starts from; wanted [H, 3]
-    takes those by its targets."""
+    """Convert the gradients of a part's end to those of its start, in place.
+
+    Args:
+        x, v: [V, 3] gradients of positions and velocities.
+        own: [B, 18] gradients of the bodies.
+        wanted: [H, 3] receives the gradients of the targets.
+    """
     time_step, parameters, holder, start_velocities = work.time_step, work.parameters, work.holder, work.start_velocities
     w = solved.velocity
     dt, nodes, count = time_step, len(x), len(own)
@@ -138,7 +143,7 @@ def _part(
         for axis in range(3):
             moved, bent = slopes.after[i, axis], slopes.displacement[i, axis]
             gradients.damping[0] += bent * w[i, axis]
-            if h >= 0:  # its end is the target, and its velocity leads there
+            if h >= 0:  # a prescribed node ends at its target, and its velocity follows from it
                 speed = v[i, axis] + moved + damping * bent
                 wanted[h, axis] += x[i, axis] + slopes.positions[i, axis] + speed / dt
                 x[i, axis] = -speed / dt
@@ -153,7 +158,7 @@ def _part(
 
 @kernel
 def _forces(work: Work, solved: Solved, y: Floats, gradients: Parameters, slopes: Motion) -> None:
-    """Gradients of Δt y · f, of forces on cloth nodes and on bodies."""
+    """Gradients of Δt y · f, for the forces f on cloth nodes and on bodies."""
     first_body_point, time_step, terms, parameters = work.first_body_point, work.time_step, work.terms, work.parameters
     motion, start_positions, rigid = work.motion, work.start_positions, work.rigid
     dt, nodes = time_step, len(start_positions)
@@ -170,7 +175,7 @@ def _forces(work: Work, solved: Solved, y: Floats, gradients: Parameters, slopes
         adjoint[first + p, 1] = dt * (y[row, 1] + turn[2] * a0 - turn[0] * a2)
         adjoint[first + p, 2] = dt * (y[row, 2] + turn[0] * a1 - turn[1] * a0)
     slopes.positions[:] = 0.0
-    slopes.after[:] = 0.0  # those by the velocities before the step are the same array
+    slopes.after[:] = 0.0  # the same array holds the gradients of the velocities before the step
     slopes.displacement[:] = 0.0
     timing, touching = Timing(dt, 0.0), solved.touching
     _reverse(terms, parameters, motion, timing, adjoint, gradients, slopes)
@@ -183,7 +188,7 @@ def _forces(work: Work, solved: Solved, y: Floats, gradients: Parameters, slopes
 
 @kernel
 def _bodies(work: Work, solved: Solved, slopes: Motion, y: Floats, own: Floats, gradients: Parameters) -> None:
-    """The rigid bodies' part of `_part`."""
+    """Contribution of the rigid bodies to `_part`."""
     time_step, first_body_point, start_positions, rigid = (
         work.time_step,
         work.first_body_point,
@@ -201,7 +206,7 @@ def _bodies(work: Work, solved: Solved, slopes: Motion, y: Floats, own: Floats, 
         turn, f = y[nodes + 2 * b + 1], force[first + p]
         lever = (f[1] * turn[2] - f[2] * turn[1], f[2] * turn[0] - f[0] * turn[2], f[0] * turn[1] - f[1] * turn[0])
         for axis in range(3):
-            old = slopes.after[first + p, axis] / dt  # of the way from where the point was
+            old = slopes.after[first + p, axis] / dt  # through the point's position at the start of the step
             new = slopes.positions[first + p, axis] + old
             own[b, axis] += new - old
             for k in range(3):

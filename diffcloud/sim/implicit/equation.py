@@ -1,4 +1,4 @@
-"""The equation of one part of a step: where velocities take all points, the forces there, and the residual."""
+"""The equation of one part of a step: positions of all points, forces, and the residual."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _plane = kernels.barrier_plane_force
 
 @kernel
 def spin_inputs(work: Work, b: int, turning: Floats, inputs: Floats, constants: Floats) -> None:
-    """What `rigid.spin` wants of a body that ends with the angular velocity `turning` [3]."""
+    """Write the inputs and constants of `rigid.spin` for body b with the final angular velocity `turning` [3]."""
     time_step, start_bodies, rigid = work.time_step, work.start_bodies, work.rigid
     constants[0] = time_step
     for k in range(9):
@@ -29,8 +29,14 @@ def spin_inputs(work: Work, b: int, turning: Floats, inputs: Floats, constants: 
 
 @kernel
 def place_points(work: Work, velocity: Floats, scenery: Floats, points: Floats, turned: Floats) -> None:
-    """Points [N, 3] at the end of the step with velocities [D, 3] and obstacles at `scenery`; turned [B, 12] takes
-    `spin`."""
+    """Compute the positions of all points [N, 3] at the end of the step.
+
+    Args:
+        velocity: [D, 3] unknowns.
+        scenery: [O, 3] obstacle points [m].
+        points: [N, 3] receives the positions [m].
+        turned: [B, 12] receives the results of `spin`.
+    """
     first_body_point, time_step, start_positions, start_bodies = (
         work.first_body_point,
         work.time_step,
@@ -61,7 +67,7 @@ def place_points(work: Work, velocity: Floats, scenery: Floats, points: Floats, 
 
 @kernel
 def body_points(rigid: Rigid, bodies: Floats, points: Floats, first: int) -> None:
-    """The points of bodies in states [B, 18], into points [N, 3] from `first` on."""
+    """Write the points of bodies in states [B, 18] into `points` [N, 3], starting at index `first`."""
     for p in range(len(rigid.body)):
         body = bodies[rigid.body[p]]
         for axis in range(3):
@@ -72,7 +78,7 @@ def body_points(rigid: Rigid, bodies: Floats, points: Floats, first: int) -> Non
 
 @kernel
 def set_motion(work: Work, velocity: Floats, points: Floats) -> None:
-    """Set the motion as terms see it: velocities of obstacles and bodies are those of their straight way."""
+    """Set `work.motion`, from which terms compute forces. Points of obstacles and bodies move straight in a step."""
     start_positions, motion, parameters = work.start_positions, work.motion, work.parameters
     start_points = work.start_points
     nodes = len(start_positions)
@@ -88,7 +94,7 @@ def set_motion(work: Work, velocity: Floats, points: Floats) -> None:
 
 @kernel
 def contact_force(work: Work, touching: Touching, force: Floats) -> None:
-    """Add the contact forces of the motion to `force` [N, 3]."""
+    """Add the contact forces of the current motion to `force` [N, 3] [N]."""
     time_step, parameters, motion = work.time_step, work.parameters, work.motion
     timing = Timing(time_step, 0.0)
     _point_point(touching.point_point, parameters, motion, timing, force)
@@ -107,7 +113,7 @@ def residual(
     touching: Touching,
     found: Floats,
 ) -> None:
-    """r [D, 3] [N·s, and N·m·s for rotations]; sets the motion."""
+    """Compute the residual r [D, 3] into `found` [N·s, rotations N·m·s], and set the motion."""
     first_body_point, time_step, terms, parameters = work.first_body_point, work.time_step, work.terms, work.parameters
     motion, start_positions, holder, start_bodies = work.motion, work.start_positions, work.holder, work.start_bodies
     rigid, start_velocities, gravity, target = work.rigid, work.start_velocities, work.gravity, work.target
@@ -145,8 +151,8 @@ def residual(
 
 @kernel
 def arm_of(rigid: Rigid, turned: Floats, p: int) -> tuple[float, float, float]:
-    """From the centre of mass to a body's point, in the world's axes [m]; turned [B, 9 or more] starts with
-    orientations."""
+    """Vector from the centre of mass to point p of a body, in the world frame [m]; `turned` [B, 9 or more] starts with the
+    rotation matrix."""
     own, t = rigid.points[p], turned[rigid.body[p]]
     return (
         t[0] * own[0] + t[1] * own[1] + t[2] * own[2],
@@ -157,7 +163,7 @@ def arm_of(rigid: Rigid, turned: Floats, p: int) -> tuple[float, float, float]:
 
 @kernel
 def first_velocities(work: Work) -> Floats:
-    """[D, 3] those of before, but for prescribed nodes: of the cloth, then of each body and its rotation."""
+    """Velocities [D, 3] at the start of the part. Prescribed nodes have those that lead to their targets."""
     start_positions, start_bodies, start_velocities = work.start_positions, work.start_bodies, work.start_velocities
     holder, target, dt = work.holder, work.target, work.time_step
     nodes, count = len(start_positions), len(start_bodies)
@@ -177,7 +183,7 @@ def first_velocities(work: Work) -> Floats:
 
 @kernel
 def resting_velocities(work: Work) -> Floats:
-    """[D, 3] those with which nothing moves from where it is."""
+    """Velocities [D, 3] with which all points stay at their current positions."""
     start_points, start_positions, time_step = work.start_points, work.start_positions, work.time_step
     found = np.zeros((len(start_positions) + 2 * len(work.start_bodies), 3))
     for i in range(len(start_positions)):
@@ -188,7 +194,7 @@ def resting_velocities(work: Work) -> Floats:
 
 @kernel
 def finish(work: Work, velocity: Floats, turned: Floats, positions: Floats, velocities: Floats, bodies: Floats) -> None:
-    """Positions and velocities [V, 3] and bodies [B, 18] after the step; prescribed nodes are where they are wanted."""
+    """Write positions and velocities [V, 3] and bodies [B, 18] after the step. Prescribed nodes are at their targets."""
     time_step, start_positions, holder, start_bodies = work.time_step, work.start_positions, work.holder, work.start_bodies
     target = work.target
     dt, nodes = time_step, len(start_positions)

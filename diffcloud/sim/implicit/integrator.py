@@ -22,7 +22,7 @@ from diffcloud.sim.terms.term import Setup
 
 
 class Implicit:
-    """Converged steps with smooth contact and rigid bodies."""
+    """Implicit steps, iterated to convergence, with smooth contact and rigid bodies."""
 
     name = "implicit"
     terms = TERMS
@@ -39,7 +39,7 @@ class Implicit:
 
     def resting_height(self, contact: ContactSettings, weight: float) -> float:
         load = 2 * weight / (contact.stiffness * contact.repulsion_thickness)
-        # of the barrier, at d = y τ: ((1 - y)²/y - 2 (1 - y) ln y)/3, which falls from infinity to 0
+        # Force of the barrier at d = y τ: ((1 - y)²/y - 2 (1 - y) ln y)/3. It decreases from infinity to 0.
         low, high = 0.0, 1.0
         for _ in range(60):
             y = (low + high) / 2

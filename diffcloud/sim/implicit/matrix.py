@@ -1,4 +1,4 @@
-"""Newton's matrix ∂r/∂w: exact, or positive semidefinite near it (cautious), or something in between."""
+"""Newton's matrix ∂r/∂w: the exact one, a positive semidefinite approximation ("cautious"), or a blend of both."""
 
 from __future__ import annotations
 
@@ -19,12 +19,13 @@ _pp_jacobian, _pe_jacobian = kernels.barrier_point_point_jacobian, kernels.barri
 _pf_jacobian, _ee_jacobian = kernels.barrier_point_face_jacobian, kernels.barrier_edge_edge_jacobian
 _plane_jacobian = kernels.barrier_plane_jacobian
 _FILL = 1.15
-"""A factor so many times as long as when its order was found is worth another order, which costs less than the factor."""
+"""Reorder the matrix once its factor has grown by this ratio since the last ordering. An ordering costs less than a
+factorisation."""
 
 
 @kernel
 def widen(work: Work, listed: Ints) -> None:
-    """Let the pattern couple the places that touch, listed [E, 5], too; what it couples already stays."""
+    """Extend the sparsity pattern by the couplings of the contacts `listed` [E, 5]. Existing entries stay."""
     wide, moved, freedom = work.wide, work.moved, work.freedom
     spare = len(wide.rows)
     first, second = np.empty(64, np.int64), np.empty(64, np.int64)
@@ -61,7 +62,8 @@ def widen(work: Work, listed: Ints) -> None:
 def newton_matrix(
     work: Work, velocity: Floats, turned: Floats, listed: Ints, numbers: Floats, touching: Touching, caution: float
 ) -> General:
-    """The factorised matrix at the motion; caution in [0, 1] is the part of the cautious one."""
+    """Assemble and factorise Newton's matrix at the current motion. `caution` in [0, 1] is the weight of the positive
+    semidefinite approximation; 0 gives the exact matrix."""
     widen(work, listed)
     time_step, start_positions, wide, terms = work.time_step, work.start_positions, work.wide, work.terms
     parameters, motion, start_bodies, pattern = work.parameters, work.motion, work.start_bodies, work.pattern
@@ -86,7 +88,7 @@ def newton_matrix(
                 for c in range(3):
                     if moved[p] >= 0:
                         below[moved[p], 3 * r + c], above[moved[p], 3 * r + c] = lower[p, 3 * r + c], upper[p, 3 * r + c]
-                    else:  # the halves change places, and the upper one is stored transposed
+                    else:  # lower and upper half swap, and the upper one is stored transposed
                         below[~moved[p], 3 * r + c], above[~moved[p], 3 * r + c] = upper[p, 3 * c + r], lower[p, 3 * c + r]
         lower, upper = below, above
     nodes = len(start_positions)
@@ -105,8 +107,8 @@ def newton_matrix(
 
 @kernel
 def _cautious(p: Parameters) -> Parameters:
-    """The cautious matrix has elastic forces and contact only. Where cloth is slack it is as stiff as where it is taut: a
-    step may make it so."""
+    """Parameters of the cautious matrix: elastic forces and contact only. Slack cloth has full stiffness, because a step
+    can make it taut."""
     none, whole = np.zeros(1), np.ones(1)
     return Parameters(
         node_mass=p.node_mass,
@@ -130,7 +132,7 @@ def _cautious(p: Parameters) -> Parameters:
 
 @kernel
 def _let_go(work: Work, lower: Floats, upper: Floats) -> None:
-    """The row of a prescribed node says only what its own change is."""
+    """Reduce the rows of prescribed nodes to their own diagonal block."""
     holder, wide, parameters = work.holder, work.wide, work.parameters
     prescribed = np.zeros(len(wide.place), np.int64)
     some = False
@@ -153,7 +155,7 @@ def _let_go(work: Work, lower: Floats, upper: Floats) -> None:
 
 @kernel
 def _add_inertia(work: Work, velocity: Floats, swing: Floats, lower: Floats) -> None:
-    """Mass and turning inertia of bodies; swing [P, 9] takes d point / d angular velocity over Δt."""
+    """Add mass and rotational inertia of bodies. `swing` [P, 9] receives d point / d angular velocity over Δt."""
     start_positions, start_bodies, parameters, wide = work.start_positions, work.start_bodies, work.parameters, work.wide
     rigid, time_step = work.rigid, work.time_step
     nodes = len(start_positions)
@@ -194,7 +196,7 @@ def _add_contact(
     lower: Floats,
     upper: Floats,
 ) -> None:
-    """Blocks of all places that touch, and how the moments of their forces change as arms turn."""
+    """Add the blocks of all contacts, and the change of their moments as lever arms rotate."""
     if caution > 0:
         _add_resistance(work, turned, listed, numbers, caution, swing, lower, upper)
     if not caution < 1:
@@ -225,7 +227,7 @@ def _add_contact(
 def _add_resistance(
     work: Work, turned: Floats, listed: Ints, numbers: Floats, caution: float, swing: Floats, lower: Floats, upper: Floats
 ) -> None:
-    """The cautious blocks of what touches."""
+    """Add the positive semidefinite blocks of the contacts."""
     parameters, motion, planes, law, dt = work.parameters, work.motion, work.planes, work.law, work.time_step
     friction = (parameters.friction[0], parameters.self_friction[0])
     x, weights, local, blocks = np.empty((4, 3)), np.empty(6), np.empty(18), np.empty((16, 9))
@@ -255,7 +257,7 @@ def _nodes_of(touching: Touching, kind: int) -> Ints:
 
 @kernel
 def _exact(work: Work, touching: Touching, kind: int, blocks: Floats) -> None:
-    """Blocks [E, n², 9] of -Δt d force / d velocity."""
+    """Write -Δt d force / d velocity of the contacts of one kind to `blocks` [E, n², 9]."""
     time_step, parameters, motion = work.time_step, work.parameters, work.motion
     dt, timing = time_step, Timing(time_step, 0.0)
     if kind == 0:
@@ -284,8 +286,13 @@ def _couple(
     lower: Floats,
     upper: Floats,
 ) -> None:
-    """Add the blocks [width², 9] between points [e, begin:], times a factor, to those between rows of the matrix: of nodes,
-    or of bodies' centres and rotations."""
+    """Add a contact's blocks to the matrix: rows of nodes, or of bodies' centres and rotations.
+
+    Args:
+        points: [E, ...] contacts; those of contact e start at column `begin`.
+        blocks: [width², 9] blocks between pairs of points.
+        factor: of the blocks.
+    """
     freedom, wide, rigid, first = work.freedom, work.wide, work.rigid, work.first_body_point
     part = np.empty(9)
     for a in range(width):
@@ -315,7 +322,7 @@ def _couple(
 
 @kernel
 def _turn_columns(swing: Floats, p: int, block: Floats) -> None:
-    """block = block swing[p]."""
+    """In-place product block = block · swing[p]."""
     for r in range(0, 9, 3):
         x, y, z = block[r], block[r + 1], block[r + 2]
         for c in range(3):
@@ -324,7 +331,7 @@ def _turn_columns(swing: Floats, p: int, block: Floats) -> None:
 
 @kernel
 def _turn_rows(x: float, y: float, z: float, block: Floats) -> None:
-    """block = [x, y, z]× block."""
+    """In-place product of the cross-product matrix of (x, y, z) and a block."""
     for c in range(3):
         a, b, d = block[c], block[3 + c], block[6 + c]
         block[c], block[3 + c], block[6 + c] = y * d - z * b, z * a - x * d, x * b - y * a

@@ -15,51 +15,51 @@ from diffcloud.sim.implicit.room import Room, away, cover, distances_at, free_wa
 from diffcloud.sim.implicit.scene import Work
 
 _TOLERANCE = 1e-11
-"""All changes of velocity still expected, relative to the largest, at which Newton's method has converged: as much as a
-geometric series with the ratio of the last two has left."""
+"""Convergence tolerance: expected sum of the remaining velocity changes, relative to the largest velocity. The sum is that
+of a geometric series with the ratio of the last two changes."""
 _ROUNDING = 1e-7
-"""Below this relative change a step that no longer shrinks has reached the arithmetic's precision."""
+"""Below this relative change, a step that no longer shrinks is at rounding precision."""
 _ITERATIONS = 30
 _BACKTRACKS = 8
 _SLOWEST = 1e-1
-"""Velocities below this are at rest for the tolerance [m/s]."""
+"""Lower bound of the velocity to which the tolerance is relative [m/s]."""
 _LEAST_CAUTION = 0.05
-"""Of the step after one that overshot with the exact matrix."""
+"""Smallest caution after a step with the exact matrix overshot."""
 _ROUGH = 1e-4
-"""Relative changes above this are checked, and shortened where they overshoot."""
+"""Steps with relative changes above this are checked, and shortened if they overshoot."""
 _REUSE = 5e-1
-"""Below this relative change a matrix serves once more, be it that of the part before, and then as long as changes shrink:
-a new one costs as much as five to ten steps with an old one, which Broyden's updates correct."""
+"""Below this relative change a factorised matrix is reused, as long as the changes shrink. This includes the matrix of the
+previous part. A new matrix costs as much as five to ten steps with an old one, which Broyden's updates correct."""
 _SHRINKING = 0.45
 _SLOWEST_RATIO = 0.9
-"""Of one change to that before it, as far as what is left after a step is told from it: changes may grow at first."""
+"""Upper bound of the ratio of two changes in the convergence test. The first changes can grow."""
 _WHOLE = 1 - 1e-9
-"""A way that is free so far is free: where it has been shortened before, only rounding keeps it from being whole."""
+"""A collision-free fraction above this counts as 1, because an earlier shortening leaves rounding errors."""
 _ALMOST_WHOLE = 0.999
-"""A step of this part of its direction shows what the residual does along it."""
+"""A step of at least this fraction of its direction is used for Broyden's update."""
 _LEAST_REST = 0.2
-"""Of the divisor in Broyden's update: a smaller one makes too much of a step."""
+"""Lower bound of the divisor in Broyden's update. Smaller divisors exaggerate a step."""
 _LEAST_PART = 1e-3
-"""Of its direction that a step goes at least: a shorter one, blocked by a contact, leaves Newton's method where it is."""
+"""Smallest useful fraction of a step. With shorter steps, blocked by a contact, Newton's method makes no progress."""
 _PROBE = 1e-4
-"""Part of the obstacles' way over which its effect is measured."""
+"""Fraction of the obstacles' motion for the finite difference that measures its effect."""
 
 
 class PlaceType(BoxType):  # type: ignore[misc]
-    """Of `Place`."""
+    """Numba type of `Place`."""
 
 
 class Place(Box):  # type: ignore[misc]
-    """Where Newton's method is.
+    """An iterate of Newton's method.
 
     Fields:
-        velocity: [D, 3]
-        scenery: [O, 3] how far obstacles have come [m].
-        points: [N, 3] [m]
-        turned: [B, 12] as of `rigid.spin`.
-        distances: [C] of the room's pairs [m].
-        listed, numbers: [E, 5], [E, 4] what touches (`contact.places`).
-        touching: the same as elements.
+        velocity: [D, 3] unknowns.
+        scenery: [O, 3] current obstacle points [m].
+        points: [N, 3] all points [m].
+        turned: [B, 12] results of `rigid.spin`.
+        distances: [C] distances of the pairs of `Room` [m].
+        listed, numbers: [E, 5], [E, 4] contacts, as in `contact.places`.
+        touching: the contacts as elements of terms.
     """
 
 
@@ -68,7 +68,7 @@ define(Place, PlaceType, ["velocity", "scenery", "points", "turned", "distances"
 
 @kernel
 def _place(work: Work, room: Room, velocity: Floats, scenery: Floats, points: Floats, turned: Floats) -> Place:
-    """The place with what touches there."""
+    """Build the iterate with its contacts."""
     surface, planes, law = work.surface, work.planes, work.law
     distances = distances_at(work, room, points)
     listed, numbers = places(surface, planes, law, room.pairs, distances, points, work.holder)
@@ -78,7 +78,7 @@ def _place(work: Work, room: Room, velocity: Floats, scenery: Floats, points: Fl
 
 @kernel
 def converge(work: Work) -> tuple[bool, Place, Room, float]:
-    """Solve one part of a step: (whether it converged, where, the room, the last relative change)."""
+    """Solve one part of a step. Return whether it converged, the last iterate, the room, and the last relative change."""
     work.wide, work.moved = work.pattern, np.arange(len(work.pattern.rows))
     count, first = len(work.start_points), first_velocities(work)
     turned, still = np.empty((len(work.start_bodies), 12)), resting_velocities(work)
@@ -86,7 +86,7 @@ def converge(work: Work) -> tuple[bool, Place, Room, float]:
     place_points(work, first, work.final_scenery, predicted, turned)
     place_points(work, still, work.start_scenery, begin, turned)
     room = room_around(work, begin, predicted)
-    # velocities go on, as far as nothing is in the way
+    # Start from the old velocities, as far as this path is free of collisions.
     here = _towards(work, _place(work, room, still, work.start_scenery, begin, turned), first - still, 1.0, room)
     left_over, trial_left = np.empty((len(first), 3)), np.empty((len(first), 3))
     residual(work, here.velocity, here.points, here.turned, here.touching, left_over)
@@ -94,7 +94,7 @@ def converge(work: Work) -> tuple[bool, Place, Room, float]:
     caution, reused = 1.0 if stale else 0.0, not stale
     work.serves = 0.0
     right, direction = np.empty((len(first), 3)), np.empty((len(first), 3))
-    steps, sizes, taken = np.empty((_ITERATIONS, len(first), 3)), np.empty(_ITERATIONS), 0  # whole ones of this matrix
+    steps, sizes, taken = np.empty((_ITERATIONS, len(first), 3)), np.empty(_ITERATIONS), 0  # full steps with this matrix
     for _ in range(_ITERATIONS):
         fresh = stale
         if stale:
@@ -136,11 +136,9 @@ def converge(work: Work) -> tuple[bool, Place, Room, float]:
 
 @kernel
 def _correct(steps: Floats, sizes: Floats, taken: int, direction: Floats) -> None:
-    """Correct the solution [D, 3] of an old matrix by what the steps since then have shown of the true one.
-
-    Broyden's update of the inverse, from these steps alone (Kelley, Iterative Methods for Linear and Nonlinear Equations,
-    SIAM 1995, section 7.3). The direction is still that of the residual: its sign is turned round afterwards.
-    """
+    """Correct the solution [D, 3] of a reused matrix by the steps taken since its factorisation. This is Broyden's update
+    of the inverse, from these steps alone (Kelley, Iterative Methods for Linear and Nonlinear Equations, SIAM 1995, section
+    7.3). The direction still has the sign of the residual. `_judge` reverses it later."""
     if taken == 0:
         return
     for k in range(taken - 1):
@@ -157,7 +155,7 @@ def _correct(steps: Floats, sizes: Floats, taken: int, direction: Floats) -> Non
 
 @kernel
 def _remember(steps: Floats, sizes: Floats, taken: int, direction: Floats) -> int:
-    """Keep a step [D, 3]; how many there are."""
+    """Store a step [D, 3] and return the new number of stored steps."""
     size = 0.0
     for i in range(len(direction)):
         for axis in range(3):
@@ -178,8 +176,8 @@ def _along(first: Floats, second: Floats) -> float:
 
 @kernel
 def _judge(holder: Ints, left_over: Floats, direction: Floats, velocity: Floats) -> tuple[float, float]:
-    """Turn a direction [D, 3] round; (how steeply the residual leads downhill along it, its size relative to
-    velocities)."""
+    """Reverse the sign of a direction [D, 3]. Return its downhill slope -r · direction and its size relative to the
+    velocities."""
     downhill, speed, size = 0.0, _SLOWEST, 0.0
     for i in range(len(direction)):
         for axis in range(3):
@@ -193,7 +191,7 @@ def _judge(holder: Ints, left_over: Floats, direction: Floats, velocity: Floats)
 
 @kernel
 def _arrived(scenery: Floats, final: Floats) -> bool:
-    """Whether obstacles [O, 3] are where they go."""
+    """Whether all obstacles [O, 3] are at the end of their motion."""
     for o in range(len(scenery)):
         for axis in range(3):
             if scenery[o, axis] != final[o, axis]:
@@ -203,10 +201,8 @@ def _arrived(scenery: Floats, final: Floats) -> bool:
 
 @kernel
 def _pushed(work: Work, here: Place, left_over: Floats, found: Floats) -> None:
-    """The residual, and how it changes as moving obstacles go the rest of their way, to first order.
-
-    Without it a step would not know that they come, and they would eat up the gap instead of pushing.
-    """
+    """The residual plus its first-order change as moving obstacles complete their motion. Without this change, a step would
+    not account for the obstacles. They would close the gap instead of pushing the cloth."""
     for i in range(len(found)):
         for axis in range(3):
             found[i, axis] = left_over[i, axis]
@@ -228,13 +224,17 @@ def _pushed(work: Work, here: Place, left_over: Floats, found: Floats) -> None:
 def _search(
     work: Work, here: Place, direction: Floats, downhill: float, room: Room, rough: bool, found: Floats
 ) -> tuple[Place, bool, float]:
-    """The step along `direction` at whose end it leads downhill still, or uphill less steeply than it began.
+    """Line search: find a step along `direction` that does not overshoot.
 
-    Where forces have a potential, that is a step along which it falls; friction, drag and damping are judged alike.
-    `found` [D, 3] takes the residual at its end.
+    At its end the residual must point downhill, or uphill less steeply than at the start. If forces have a potential, the
+    potential decreases along such a step. The criterion also works for friction, drag and damping.
+
+    Args:
+        found: [D, 3] receives the residual at the end of the step.
 
     Returns:
-        (the place, whether the step had to be shortened for it, which part of the direction it goes)
+        The new iterate, whether the step was shortened to avoid overshooting, and the fraction of the direction that it
+        covers.
     """
     alpha, short, trial, holder, part = 1.0, False, here, work.holder, 1.0
     most = 1e-300
@@ -261,7 +261,7 @@ def _search(
 
 @kernel
 def _towards(work: Work, here: Place, direction: Floats, alpha: float, room: Room) -> Place:
-    """`here` + α direction with the longest α up to the given one that has no collision on the way."""
+    """Step to `here` + α direction, with the largest α up to the given one that is free of collisions."""
     old, began, final = here.velocity, here.scenery, work.final_scenery
     for attempt in range(_BACKTRACKS + 2):
         velocity, scenery = np.empty((len(direction), 3)), np.empty((len(final), 3))
@@ -284,6 +284,6 @@ def _towards(work: Work, here: Place, direction: Floats, alpha: float, room: Roo
         fraction = free_way(work, room, here.distances, here.points, points)
         if fraction > _WHOLE:
             return _place(work, room, velocity, scenery, points, turned)
-        # what is straight in velocities is not quite straight in space where bodies turn: look again at the shorter step
+        # A straight line in velocities is not straight in space if bodies rotate, so the shorter step is checked again.
         alpha *= 0.0 if attempt >= _BACKTRACKS else (fraction * 0.9 if attempt > 0 else fraction)
-    return here  # no step this way is free of collisions
+    return here  # no step in this direction is free of collisions

@@ -1,4 +1,4 @@
-"""A solved part of a step, found again for its derivatives."""
+"""Reconstructs a solved part of a step, for its derivatives."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from diffcloud.sim.implicit.step import begin_part
 
 
 class SolvedType(BoxType):  # type: ignore[misc]
-    """Of `Solved`."""
+    """Numba type of `Solved`."""
 
 
 class Solved(Box):  # type: ignore[misc]
-    """The end of a part.
+    """Solution of one part of a step.
 
     Fields:
-        velocity: [D, 3]
-        turned: [B, 12] as of `rigid.spin`.
-        touching: what touches, as elements.
-        matrix: the exact one, factorised.
-        gone: which part of its way a prescribed node has gone; the rest is where the step began.
+        velocity: [D, 3] solution.
+        turned: [B, 12] results of `rigid.spin`.
+        touching: the contacts as elements of terms.
+        matrix: the exact Newton matrix, factorised.
+        gone: fraction of the step at the end of this part. Prescribed nodes have covered this fraction of their path.
     """
 
 
@@ -45,11 +45,11 @@ def solved_part(
     bodies: Floats,
     kept: Kept,
 ) -> Solved:
-    """A part of a step: sets its start and its motion in `work`.
+    """Reconstruct a part of a step, and set its start and motion in `work`.
 
     Args:
-        obstacles: [S + 1, O, 3] [m]
-        positions, velocities, bodies: [S + 1, ...] after each step.
+        obstacles: [S + 1, O, 3] obstacle points [m].
+        positions, velocities, bodies: [S + 1, ...] states after each step.
     """
     nodes, count = positions.shape[1], bodies.shape[1]
     x, v, own = positions[0].copy(), velocities[0].copy(), bodies[0].copy()
@@ -86,13 +86,13 @@ def solved_part(
 
 @kernel
 def _begin(kept: Kept, part: int) -> int:
-    """Where in its step a part begins."""
+    """Start of a part within its step, in units of 1 / `PARTS`."""
     return 0 if part == 0 or kept.ends[part - 1] == PARTS else kept.ends[part - 1]
 
 
 @kernel
 def _read(state: Floats, positions: Floats, velocities: Floats, bodies: Floats) -> None:
-    """A row of `Kept.states`."""
+    """Read a row of `Kept.states` into positions, velocities and bodies."""
     nodes = len(positions)
     for i in range(nodes):
         for axis in range(3):

@@ -1,4 +1,7 @@
-"""Pairs near each other while all points stay within a distance of their straight paths in a step."""
+"""List of primitive pairs that can come into contact in a step.
+
+Valid while all points stay within a distance, the room, of their straight predicted paths.
+"""
 
 from __future__ import annotations
 
@@ -16,30 +19,30 @@ from diffcloud.sim.contact.places import gap_of
 from diffcloud.sim.implicit.scene import Work
 
 _ROOM = 0.1
-"""First guess of how far points leave their predicted path, as part of the thickness and of the path."""
+"""Initial size of the room, as a fraction of the contact thickness and of the path length."""
 _SPARE = 1.25
-"""Where points have left it, a room becomes so many times as wide as they need."""
+"""When points leave a room, the new size is this multiple of their distance from the path."""
 _LONGEST = 5.0
-"""Newton's steps are kept within this many times the thickness and the path."""
+"""Largest size of the room, in multiples of thickness plus path length. Newton's steps stay within it."""
 _CLOSEST = 1e-6
-"""Part of the thickness below which nothing may come closer."""
+"""Smallest allowed distance, as a fraction of the contact thickness."""
 _LEFT = 0.2
-"""Part of the distance to a half-space that a step leaves."""
+"""Fraction of the distance to a half-space that remains after a step."""
 
 
 class RoomType(BoxType):  # type: ignore[misc]
-    """Of `Room`."""
+    """Numba type of `Room`."""
 
 
 class Room(Box):  # type: ignore[misc]
-    """A path, and the pairs that may touch near it.
+    """A predicted path, and the pairs that can touch near it.
 
     Fields:
-        begin, predicted: [N, 3] [m]
-        size: how far from the path points may be, as `away` measures [m].
-        longest: how far they may ever be [m].
-        pairs: [C, 8] kind (1: two edges), points, primitives, and 1 if they are near at rest.
-        distances: [C] at the beginning [m].
+        begin, predicted: [N, 3] start and predicted end of the path [m].
+        size: current limit of the distance from the path, as `away` measures it [m].
+        longest: absolute limit of this distance [m].
+        pairs: [C, 8] kind (1: two edges), four points, two primitives, and 1 if the pair is close at rest.
+        distances: [C] distances at `begin` [m].
     """
 
 
@@ -48,7 +51,7 @@ define(Room, RoomType, ["begin", "predicted", "size", "longest", "pairs", "dista
 
 @kernel
 def room_around(work: Work, begin: Floats, predicted: Floats) -> Room:
-    """The room of a path between points [N, 3]."""
+    """Create the room around the path between two sets of points [N, 3]."""
     law = work.law
     path = 0.0
     for i in range(len(begin)):
@@ -64,17 +67,15 @@ def room_around(work: Work, begin: Floats, predicted: Floats) -> Room:
 
 @kernel
 def cover(work: Work, room: Room, distance: float) -> None:
-    """Let points be so far from the path [m]."""
+    """Enlarge the room to include points at this distance from the path [m]."""
     room.size = min(_SPARE * distance, room.longest)
     _list(work, room)
 
 
 @kernel
 def away(room: Room, points: Floats) -> float:
-    """How far the farthest point is from where it would be, if all had gone the same part of their paths [m].
-
-    The part is that which fits best, so what lies between two such places is no farther away than both.
-    """
+    """Largest distance of a point from its path, if all points had covered the same fraction of their paths [m]. The
+    fraction is the best fit. So points between two such sets are at most as far away as in the worse of both."""
     begin, predicted = room.begin, room.predicted
     along, path = 0.0, 1e-300
     for i in range(len(points)):
@@ -96,7 +97,7 @@ def away(room: Room, points: Floats) -> float:
 def prescribed(
     work: Work,
 ) -> Ints:
-    """[N] 1 for points whose motion is prescribed; all zero where no node's is."""
+    """[N] 1 for points with prescribed motion. All are zero if no node is prescribed."""
     moves, holder = work.moves, work.holder
     found = np.zeros(len(moves), np.int64)
     some = False
@@ -112,10 +113,8 @@ def prescribed(
 
 @kernel
 def _list(work: Work, room: Room) -> None:
-    """Find the room's pairs: those that come nearer than the thickness somewhere in it.
-
-    What only prescribed points could resolve is left out.
-    """
+    """List the room's pairs: those that can come closer than the thickness within it. Pairs whose points are all prescribed
+    are omitted."""
     surface, law = work.surface, work.law
     begin, predicted, reached = room.begin, room.predicted, 2 * room.size
     point_face, edge_edge = candidates(surface, begin, predicted, reached + law[0, 1])
@@ -134,7 +133,7 @@ def _list(work: Work, room: Room) -> None:
             row[0], row[1], row[2], row[3], row[4] = kind, i, j, k, l
             row[5], row[6], row[7] = listed[c, 0], listed[c, 1], listed[c, 2]
             distances[count] = distance_of(pairs, count, begin, x, found)
-            # what a pair has in common does not bring it together: neighbours on a moving cloth stay as far apart
+            # Common motion of a pair does not change its distance: neighbours on a moving cloth stay at the same distance.
             if distances[count] - approach(pairs, count, begin, predicted, x, motion) < reached + law[row[7], 1]:
                 count += 1
     room.pairs, room.distances = pairs[:count], distances[:count]
@@ -142,7 +141,7 @@ def _list(work: Work, room: Room) -> None:
 
 @kernel
 def distance_of(pairs: Ints, c: int, points: Floats, x: Floats, found: Floats) -> float:
-    """Of the primitives of a pair [m]; x [4, 3] and found [6] are room."""
+    """Distance between the primitives of a pair [m]. `x` [4, 3] and `found` [6] are scratch space."""
     for k in range(4):
         for axis in range(3):
             x[k, axis] = points[pairs[c, 1 + k], axis]
@@ -151,7 +150,7 @@ def distance_of(pairs: Ints, c: int, points: Floats, x: Floats, found: Floats) -
 
 @kernel
 def distances_at(work: Work, room: Room, points: Floats) -> Floats:
-    """Distances [C] of the room's pairs at points [N, 3], or lower bounds where those are beyond the thickness [m]."""
+    """Distances [C] of the room's pairs at points [N, 3], or lower bounds if they exceed the thickness [m]."""
     law = work.law
     pairs, begin, old = room.pairs, room.begin, room.distances
     distances = np.empty(len(pairs))
@@ -160,7 +159,7 @@ def distances_at(work: Work, room: Room, points: Floats) -> Floats:
     moved = path_lengths(begin, points)
     x, found = np.empty((4, 3)), np.empty(6)
     for c in range(len(distances)):
-        # a pair cannot have come closer than its points have moved: most need no look at their geometry
+        # The points' displacement bounds the change of distance. For most pairs, this avoids the exact computation.
         distances[c] = old[c] - reach(pairs, c, moved)
         if distances[c] < law[pairs[c, 7], 1]:
             distances[c] = distance_of(pairs, c, points, x, found)
@@ -169,11 +168,8 @@ def distances_at(work: Work, room: Room, points: Floats) -> Floats:
 
 @kernel
 def free_way(work: Work, room: Room, distances: Floats, points: Floats, ends: Floats) -> float:
-    """In [0, 1]: how far all points may go straight from `points` to `ends` [N, 3] without touching.
-
-    Args:
-        distances: [C] of the room's pairs at `points`.
-    """
+    """Fraction in [0, 1] of the straight path from `points` to `ends` [N, 3] that is free of collisions. `distances` [C]
+    are those of the room's pairs at `points`."""
     planes, law = work.planes, work.law
     allowed = 1.0
     if len(planes.offsets) > 0:

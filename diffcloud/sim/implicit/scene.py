@@ -1,4 +1,4 @@
-"""What the kernels of the implicit step are given, and what they keep for the derivatives."""
+"""Data structures of the implicit kernels: constant scene, work space, and records for the derivatives."""
 
 from __future__ import annotations
 
@@ -17,75 +17,75 @@ from diffcloud.sim.contact.surface import Surface, boxed
 from diffcloud.sim.status import FIRST_OWN
 
 PARTS = 32
-"""A step may be halved into so many parts."""
+"""Largest number of parts into which a step can be halved."""
 BODY = 18
-"""Numbers of a body's state: centre [m], orientation row by row, velocity [m/s], angular velocity [rad/s]."""
+"""Length of a body's state: centre [m], rotation matrix in row-major order, velocity [m/s], angular velocity [rad/s]."""
 STUCK = FIRST_OWN
-"""A status: a step did not converge."""
+"""Status: a step did not converge."""
 
 
 class Rigid(NamedTuple):
-    """Bodies that contact moves."""
+    """Rigid bodies that contact moves."""
 
     points: Floats
-    """[P, 3] mesh points in the body's axes, from its centre of mass [m]."""
+    """[P, 3] mesh points in the body frame, whose origin is the centre of mass [m]."""
     body: Ints
-    """[P] body of each point."""
+    """[P] index of the body of each point."""
     gyration: Floats
-    """[B, 9] inertia per mass in the body's axes [m²]."""
+    """[B, 9] inertia per mass in the body frame [m²]."""
 
 
 class Scene(NamedTuple):
-    """Everything constant in a run."""
+    """All data that are constant in a simulation."""
 
     terms: Any
-    """`kernels.Terms`"""
+    """Elements of the force terms (`kernels.Terms`)."""
     pattern: Pattern
-    """Over V + 2 B places."""
+    """Sparsity pattern of the matrix, with V + 2 B rows."""
     time_step: float
-    """[s]"""
+    """Time step [s]."""
     second_order: bool
-    """Whether steps are BDF2's; else backward Euler's."""
+    """True: BDF2. False: backward Euler."""
     gravity: Floats
-    """[3] [m/s²]"""
+    """[3] gravitational acceleration [m/s²]."""
     surface: Surface
     planes: Planes
     law: Floats
-    """[2, 3] of contact, and of contact between what is near at rest (`rest`): k_c [N/m³], d̂ [m], v_s [m/s]."""
+    """[2, 3] contact parameters k_c [N/m³], d̂ [m], v_s [m/s]: for usual pairs, and for pairs that are close at rest
+    (`rest`)."""
     moves: NDArray[np.bool_]
-    """[N] of cloth nodes, obstacle points and body points: those that contact can move."""
+    """[N] True for the cloth nodes, obstacle points and body points that contact can move."""
     rigid: Rigid
     obstacle_points: int
-    """O, of static and moving obstacles."""
+    """Number O of points on static and moving obstacles."""
 
 
 class WorkType(BoxType):  # type: ignore[misc]
-    """Of `Work`."""
+    """Numba type of `Work`."""
 
 
 class Work(Box):  # type: ignore[misc]
-    """A scene, and the part of a step that is worked on.
+    """A scene, and the part of a step that is being solved.
 
-    Fields that are no scene's:
-        freedom: [N, 2] the rows of each point's motion: its own, or its body's centre and rotation; below zero: none.
+    Fields that are not in `Scene`:
+        freedom: [N, 2] matrix rows of each point: its own, or its body's centre and rotation; -1 for none.
         first_body_point: V + O.
-        parameters, motion: of the whole cloth; `motion` is room.
+        parameters, motion: of the whole cloth; `motion` is scratch space.
         length: of the part [s].
-        keep, back: weights of the last and the last but one state in `start_positions` and `start_velocities`.
-        time_step: by which velocities and forces at the part's end act [s]; shorter than `length` in BDF2.
-        start_positions, start_velocities: [V, 3] what they act on: the start, or where two last states lead [m], [m/s].
-        start_bodies: [B, 18]
-        start_scenery, final_scenery: [O, 3] where obstacles are, and where they go [m].
-        start_points: [N, 3] all points where the part starts [m].
-        holder: [V] the handle that prescribes each node; -1: none.
-        target: [H, 3] where prescribed nodes go [m].
-        wide, moved: the pattern that also couples what touches, and where the blocks of the scene's own lie in it, as
-            `sparse.widened` says.
-        order: [V + 2 B] in which wide patterns are eliminated.
-        fill: blocks of a factor when that order was found.
-        last: the factorised matrix with which the part before ended.
-        left_path: how far from its straight path that part ended [m]; the next one will not differ by much.
-        serves: the `time_step` of that part [s]; 0: its matrix is of no use for this one.
+        keep, back: weights of the last state and the state before it in `start_positions` and `start_velocities`.
+        time_step: factor of velocities and forces at the part's end [s]; shorter than `length` in BDF2.
+        start_positions, start_velocities: [V, 3] x̂ and v̂ of the equation [m], [m/s].
+        start_bodies: [B, 18] states at the start.
+        start_scenery, final_scenery: [O, 3] obstacle points at the start and end of the part [m].
+        start_points: [N, 3] all points at the start of the part [m].
+        holder: [V] the handle that prescribes each node; -1 for none.
+        target: [H, 3] where prescribed nodes end [m].
+        wide, moved: pattern extended by contacts, and the indices of the scene's blocks in it (`sparse.widened`).
+        order: [V + 2 B] elimination order of extended patterns.
+        fill: number of blocks of the factor when this order was computed.
+        last: final factorised matrix of the previous part.
+        left_path: final distance of the previous part from its straight path [m]. It predicts that of the next part.
+        serves: `time_step` of the previous part [s]; 0 if its matrix cannot be reused.
     """
 
 
@@ -130,9 +130,9 @@ define(
 
 @kernel
 def new_work(scene: Scene, parameters: Parameters, nodes: int, bodies: int) -> Work:
-    """Room to work on a scene."""
+    """Allocate the work space for a scene."""
     count, others = scene.surface.point_count, scene.obstacle_points
-    velocities = np.zeros((count, 3))  # before and after a step are one array here, that of its end
+    velocities = np.zeros((count, 3))  # one array: velocities before and after a step are both those of its end
     motion = Motion(np.zeros((count, 3)), velocities, velocities, np.zeros((count, 3)))
     freedom = np.full((count, 2), -1, np.int64)
     for i in range(nodes):
@@ -176,25 +176,25 @@ def new_work(scene: Scene, parameters: Parameters, nodes: int, bodies: int) -> W
 
 
 class Past(NamedTuple):
-    """The state before the part that is worked on."""
+    """The state before the current part, for BDF2."""
 
     positions: Floats
-    """[V, 3] [m]"""
+    """[V, 3] positions [m]."""
     velocities: Floats
-    """[V, 3] [m/s]"""
+    """[V, 3] velocities [m/s]."""
     length: Floats
-    """[1] of the part between, as part of a step; 0: there is none."""
+    """[1] length of the part between both states, as a fraction of a step; 0 if there is no earlier state."""
 
 
 @kernel
 def no_past(nodes: int) -> Past:
-    """Before an episode."""
+    """`Past` at the start of an episode."""
     return Past(np.zeros((nodes, 3)), np.zeros((nodes, 3)), np.zeros(1))
 
 
 @kernel
 def follow(past: Past, length: float, positions: Floats, velocities: Floats) -> None:
-    """The start of a part that is done becomes the past of the next one."""
+    """Make the start of a finished part the past of the next one."""
     past.length[0] = length
     for i in range(len(positions)):
         for axis in range(3):
@@ -202,25 +202,25 @@ def follow(past: Past, length: float, positions: Floats, velocities: Floats) -> 
 
 
 class Kept(NamedTuple):
-    """What an episode's derivatives need of each step and its parts."""
+    """Record of each step and its parts, for the derivatives."""
 
     begins: Ints
-    """[S + 1] the first part of each step."""
+    """[S + 1] index of the first part of each step."""
     ends: Ints
-    """[n] where in its step each part ends, of `PARTS`."""
+    """[n] end of each part within its step, in units of 1 / `PARTS`."""
     states: Floats
-    """[n, 6 V + 18 B] the end of each part: positions, velocities, bodies."""
+    """[n, 6 V + 18 B] state at the end of each part: positions, velocities, bodies."""
     first_place: Ints
-    """[n + 1] the first place that touches in each part."""
+    """[n + 1] index of the first contact of each part."""
     listed: Ints
-    """[., 5] as of `contact.places`."""
+    """[., 5] contacts, as in `contact.places`."""
     numbers: Floats
-    """[., 4]"""
+    """[., 4] numbers of the contacts, as in `contact.places`."""
 
 
 @kernel
 def nothing_kept(steps: int, width: int) -> Kept:
-    """An empty record of states that are so wide."""
+    """Empty record for states of the given width."""
     return Kept(
         np.zeros(steps + 1, np.int64),
         np.zeros(steps + 8, np.int64),

@@ -1,4 +1,4 @@
-"""An episode of implicit steps, each halved where it does not converge."""
+"""The loop over the implicit steps of an episode. A step that does not converge is halved."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from diffcloud.sim.implicit.scene import (
 from diffcloud.sim.status import DONE, INTERRUPTED, NOT_FINITE
 
 _GROWTH = 2.0
-"""A part may be so many times as long as the one before it; BDF2 is stable up to 1 + √2."""
+"""Largest ratio of the lengths of successive parts for BDF2, which is stable up to 1 + √2."""
 
 
 @kernel
@@ -47,22 +47,21 @@ def simulate(
     control: Ints,
     fault: Floats,
 ) -> tuple[int, int, Kept]:
-    """All steps of one cloth.
+    """Simulate all steps of one cloth.
 
     Args:
-        track: [S, G, 3] displacement of each gripper at the end of each step [m]; of any length where no handle follows
-            one.
-        obstacles: [S + 1, O, 3] points of static and moving obstacles at the steps' times [m].
-        anchors: [H, 3] takes those of the handles.
-        positions, velocities: [S + 1, V, 3] the first is the start; take the others.
-        bodies: [S + 1, B, 18] centre, orientation row by row, velocity, angular velocity; the first is the start.
-        keep: below zero: nothing is kept for the derivatives.
-        control: [2] finished steps are added to the first; the second one stops the run when it is not zero.
-        fault: [6] where the run got stuck: the relative change, the kind of the closest pair (0: point and face,
-            1: two edges, 2: point and plane, -1: none) and its points.
+        track: [S, G, 3] displacement of each gripper at the end of each step [m]. Any length if no handle follows a track.
+        obstacles: [S + 1, O, 3] points of static and moving obstacles at the start and after each step [m].
+        anchors: [H, 3] receives the anchors of the handles.
+        positions, velocities: [S + 1, V, 3] the first row is the initial state; receive the others.
+        bodies: [S + 1, B, 18] centre, rotation matrix in row-major order, velocity, angular velocity, likewise.
+        keep: negative to store nothing for the derivatives.
+        control: [2] the first number counts finished steps. If another thread sets the second one, the run stops.
+        fault: [6] receives details if a step does not converge: the relative change, the kind of the closest pair (0: point
+            and face, 1: two edges, 2: point and plane, -1: none) and its points.
 
     Returns:
-        (how it ended (`status`), the step in which it did, what the derivatives need)
+        The status, the index of the step in which the run ended, and the record for the derivatives.
     """
     steps, nodes = len(positions) - 1, positions.shape[1]
     kept = nothing_kept(steps if keep >= 0 else 0, 6 * nodes + BODY * bodies.shape[1])
@@ -106,7 +105,7 @@ def simulate(
                 follow(past, length / PARTS, positions[step + 1], velocities[step + 1])
             finish(work, here.velocity, here.turned, positions[step + 1], velocities[step + 1], bodies[step + 1])
             place += length
-            length = place & -place  # the other half, or that of the part which both make up
+            length = place & -place  # the second half, or the sibling of the interval that both halves form
             if keep >= 0:
                 kept = _remember(
                     kept,
@@ -141,14 +140,15 @@ def begin_part(
     bodies: Floats,
     past: Past,
 ) -> None:
-    """Set what the part [begin, end] of a step starts from, of `PARTS`; prescribed nodes and obstacles go straight.
+    """Set the start of the part [begin, end] of a step, in units of 1 / `PARTS`. Prescribed nodes and obstacles move
+    straight.
 
     Args:
         time_step: of the whole step [s].
-        before, after: [O, 3] obstacles at its ends [m].
-        first: [V, 3] positions at its start [m].
+        before, after: [O, 3] obstacle points at the start and end of the step [m].
+        first: [V, 3] positions at the start of the step [m].
         positions, velocities, bodies: at the start of this part.
-        past: of the part before.
+        past: state before this part.
     """
     a, b = begin / PARTS, end / PARTS
     work.length = (b - a) * time_step
@@ -182,9 +182,12 @@ def begin_part(
 
 @kernel
 def _weights(length: float, before: float) -> tuple[float, float, float]:
-    """Of the last state, of that before it, and of the rate at the end in BDF2 with a part so long and one before it.
+    """BDF2 weights of the last state, of the state before it, and of the rate at the end.
 
-    Without one before, or one that is too short for the method's stability, those of backward Euler.
+    Without an earlier state, or if the earlier part is too short for stability, these are the weights of backward Euler.
+
+    Args:
+        length, before: of this part and of the previous one, as fractions of a step.
     """
     if before == 0 or length > _GROWTH * before:
         return 1.0, 0.0, 1.0
@@ -206,7 +209,7 @@ def _finite(positions: Floats) -> bool:
 def _remember(
     kept: Kept, part: int, end: int, positions: Floats, velocities: Floats, bodies: Floats, listed: Ints, numbers: Floats
 ) -> Kept:
-    """The record with one part more."""
+    """Append a part to the record."""
     ends, states, first = kept.ends, kept.states, kept.first_place
     if part + 1 >= len(ends):
         ends, first = np.empty(2 * len(ends), np.int64), np.empty(2 * len(ends) + 1, np.int64)
@@ -239,13 +242,13 @@ def _remember(
 
 @kernel
 def _closest(work: Work, points: Floats, pairs: Ints, fault: Floats) -> None:
-    """The closest pair of all at points [N, 3], into fault [6]."""
+    """Write the closest pair at points [N, 3] into `fault` [6]."""
     smallest = np.inf
     fault[1] = -1.0
     planes = work.planes
     for q in range(len(planes.points)):
         i = planes.points[q]
-        if i < len(work.holder) and work.holder[i] >= 0:  # goes through
+        if i < len(work.holder) and work.holder[i] >= 0:  # prescribed nodes may pass through planes
             continue
         for w in range(len(planes.offsets)):
             gap = gap_of(planes, w, points, i)

@@ -1,5 +1,5 @@
-"""Derivatives of an episode of implicit steps forwards, along several directions at once: one factor for each part of
-a step."""
+"""Forward-mode derivatives of an episode of implicit steps along several directions, with one factorisation per part of a
+step."""
 
 from __future__ import annotations
 
@@ -39,14 +39,14 @@ def tangents(
     velocity_rates: Floats,
     body_rates: Floats,
 ) -> None:
-    """Carry K directions through an episode that `step.simulate` kept.
+    """Propagate K directional derivatives through an episode that `step.simulate` kept.
 
     Args:
-        parameter_rates: each field with a leading axis K; its `target` is room, its `hold` is zero.
-        track_rates: [K, S, G, 3]
-        track, obstacles, anchors, positions, velocities, bodies: as `simulate` took and left them.
-        position_rates, velocity_rates, body_rates: [S + 1, K, V, 3], [S + 1, K, V, 3], [S + 1, K, B, 18]; the first
-            rows are those of the start, the others are taken.
+        parameter_rates: derivatives, each field with a leading axis K. `hold` must be zero. `target` is scratch space.
+        track_rates: [K, S, G, 3] derivatives of the track.
+        track, obstacles, anchors, positions, velocities, bodies: as passed to and filled by `simulate`.
+        position_rates, velocity_rates, body_rates: [S + 1, K, V, 3], [S + 1, K, V, 3], [S + 1, K, B, 18] derivatives of the
+            states. The first rows are those of the initial state; the others are filled.
     """
     steps, nodes, count, directions = len(positions) - 1, positions.shape[1], bodies.shape[1], position_rates.shape[1]
     work, points = new_work(scene, parameters, nodes, count), scene.surface.point_count
@@ -59,7 +59,7 @@ def tangents(
     anchor_rates, target = np.empty((directions, len(held.node), 3)), np.empty((directions, len(held.node), 3))
     for d in range(directions):
         copy_to(anchor_rates[d], first_anchors(held, position_rates[0, d]))
-    early_x, early_v = np.zeros((directions, nodes, 3)), np.zeros((directions, nodes, 3))  # before the part before
+    early_x, early_v = np.zeros((directions, nodes, 3)), np.zeros((directions, nodes, 3))  # of the part before
     for step in range(steps):
         take_anchors_tangent(held, track_rates, step, position_rates[step], anchor_rates)
         aim(held, track, step, anchors, parameters)
@@ -88,7 +88,8 @@ def tangents(
 
 @kernel
 def _aimed(holder: Ints, gone: float, first: Floats, wanted: Floats, target: Floats) -> None:
-    """Rates of where prescribed nodes go in a part, from those at the step's start and of its targets."""
+    """Derivatives of the targets of prescribed nodes at the end of a part, from those of the step's start and of its
+    targets."""
     for i in range(len(holder)):
         h = holder[i]
         if h >= 0:
@@ -108,7 +109,7 @@ def _part(
     v: Floats,
     own: Floats,
 ) -> None:
-    """Rates of what a part starts from (x, v [K, V, 3], own [K, B, 18]) become those of its end."""
+    """Convert the derivatives of a part's start (x, v [K, V, 3], own [K, B, 18]) to those of its end, in place."""
     time_step, holder, motion, parameters = work.time_step, work.holder, work.motion, work.parameters
     start_velocities = work.start_velocities
     w = solved.velocity
@@ -159,7 +160,7 @@ def _part(
 
 @kernel
 def _turned(work: Work, solved: Solved, b: int, own: Floats, turns: Floats, found: Floats) -> None:
-    """Rates [K, 12] of `spin` of a body, while its new angular velocity is held."""
+    """Derivatives [K, 12] of a body's `spin`, with its new angular velocity held constant."""
     start_positions = work.start_positions
     inputs, constants = np.empty(15), np.empty(10)
     spin_inputs(work, b, solved.velocity[len(start_positions) + 2 * b + 1], inputs, constants)
@@ -173,7 +174,8 @@ def _turned(work: Work, solved: Solved, b: int, own: Floats, turns: Floats, foun
 
 @kernel
 def _finish(work: Work, solved: Solved, b: int, d: int, own: Floats, turns: Floats, found: Floats) -> None:
-    """The rates of a body's orientation and angular velocity, whose new rate is in turns[d, 12:]."""
+    """Update the derivatives of a body's orientation and angular velocity. turns[d, 12:] has that of the new angular
+    velocity."""
     start_positions = work.start_positions
     inputs, constants = np.empty(15), np.empty(10)
     spin_inputs(work, b, solved.velocity[len(start_positions) + 2 * b + 1], inputs, constants)
@@ -190,7 +192,7 @@ def _finish(work: Work, solved: Solved, b: int, d: int, own: Floats, turns: Floa
 
 @kernel
 def _body_points(work: Work, own: Floats, turned: Floats, rates: Motion) -> None:
-    """Rates of the bodies' points and of their straight way through the step."""
+    """Derivatives of the bodies' points, and of their straight motion through the step."""
     time_step, first_body_point, rigid = work.time_step, work.first_body_point, work.rigid
     dt, first = time_step, first_body_point
     for p in range(len(rigid.body)):
@@ -217,7 +219,7 @@ def _body_rows(
     change: Floats,
     right: Floats,
 ) -> None:
-    """The bodies' rows of -dr along direction d."""
+    """Rows of the bodies in the right-hand side -dr along direction d."""
     time_step, first_body_point, start_positions, rigid = (
         work.time_step,
         work.first_body_point,
@@ -246,7 +248,7 @@ def _body_rows(
 
 @kernel
 def _forces(work: Work, solved: Solved, parameter_rates: Parameters, rates: Motion, change: Floats) -> None:
-    """Rates [K, N, 3] of all forces."""
+    """Derivatives [K, N, 3] of all forces."""
     terms, parameters, motion, time_step = work.terms, work.parameters, work.motion, work.time_step
     timing, touching = Timing(time_step, 0.0), solved.touching
     _tangent(terms, parameters, motion, timing, parameter_rates, rates, change)

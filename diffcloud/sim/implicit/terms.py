@@ -1,4 +1,4 @@
-"""The forces of the implicit step, and the kernels that are generated from them (`sim.compiled.module`)."""
+"""Force terms of the implicit integrator, and the kernels generated from them (`sim.compiled.module`)."""
 
 from diffcloud.sim.compiled.module import integrator_kernels
 from diffcloud.sim.contact.barrier import (
@@ -19,7 +19,7 @@ CONTACTS: tuple[Term, ...] = (
     BARRIER_EDGE_EDGE,
     BARRIER_PLANE,
 )
-"""Forces between points that each step finds."""
+"""Contact terms, whose point pairs each step detects."""
 
 kernels = integrator_kernels("implicit", TERMS, (), CONTACTS, (SPIN,))
-"""`kernels.jacobian`, `kernels.Terms`, `kernels.bending_force`, ..."""
+"""Module of the generated kernels, such as `kernels.jacobian`, `kernels.Terms` and `kernels.bending_force`."""

@@ -1,12 +1,12 @@
-"""Movable obstacles: mass and inertia of their meshes, and their states.
+"""Rigid bodies that contact can move: mass and inertia of their meshes, and their states.
 
-A step moves a body with its new velocities: centre c₁ = c₀ + Δt v₁, orientation R₁ = exp(Δt ω₁) R₀. The equations are
-the balances of linear and of angular momentum,
+A step moves a body with its velocities at the end of the step: centre c₁ = c₀ + Δt v₁, orientation R₁ = exp(Δt ω₁) R₀. The
+equations are the balances of linear and of angular momentum,
 
     M (v₁ - v₀) = Δt (M g + Σ f),      I(R₁) ω₁ - I(R₀) ω₀ = Δt Σ (p - c₁) × f,
 
-so that a body without contact keeps its angular momentum exactly (`rigid.spin`). (The reference simulator uses Euler
-angles, a point mass per node and no angular acceleration.)
+so a body without contact conserves its angular momentum exactly (`rigid.spin`). ARCSim instead uses Euler angles, a point
+mass per node and no angular acceleration.
 """
 
 from __future__ import annotations
@@ -27,13 +27,13 @@ class BodyState:
     """Poses and velocities of N bodies in a batch."""
 
     centre: Tensor
-    """[B, N, 3] of mass [m]."""
+    """[B, N, 3] centre of mass [m]."""
     orientation: Tensor
-    """[B, N, 3, 3] from body to world."""
+    """[B, N, 3, 3] rotation matrix from the body frame to the world frame."""
     velocity: Tensor
-    """[B, N, 3] [m/s]"""
+    """[B, N, 3] velocity of the centre of mass [m/s]."""
     angular_velocity: Tensor
-    """[B, N, 3] in the world's axes [rad/s]."""
+    """[B, N, 3] angular velocity in the world frame [rad/s]."""
 
     def tensors(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         return self.centre, self.orientation, self.velocity, self.angular_velocity
@@ -41,25 +41,25 @@ class BodyState:
 
 @dataclass(frozen=True)
 class Bodies:
-    """B rigid bodies."""
+    """Constant data of B rigid bodies."""
 
     points: NDArray[np.float64]
-    """[P, 3] mesh points in the body's axes, from its centre of mass [m]."""
+    """[P, 3] mesh points in the body frame, whose origin is the centre of mass [m]."""
     body: NDArray[np.int64]
-    """[P] body of each point."""
+    """[P] index of the body of each point."""
     mass: NDArray[np.float64]
-    """[B] [kg]"""
+    """[B] mass of each body [kg]."""
     gyration: NDArray[np.float64]
-    """[B, 3, 3] inertia per mass in the body's axes [m²]."""
+    """[B, 3, 3] inertia per mass in the body frame [m²]."""
     start: NDArray[np.float64]
-    """[B, 18] centre, orientation row by row, velocity, angular velocity."""
+    """[B, 18] initial states: centre, rotation matrix in row-major order, velocity, angular velocity."""
 
     @staticmethod
     def build(bodies: Sequence[RigidBody]) -> Bodies:
-        """Mass properties of the meshes (trimesh integrates over the volume).
+        """Compute mass and inertia from the volumes of the meshes.
 
         Raises:
-            SceneError: a mesh that is open or turned inside out, or a mass or density that is not positive.
+            SceneError: a mesh is open or its faces point inwards, or a mass or density is not positive.
         """
         points, index, masses, gyrations, starts = [np.zeros((0, 3))], [np.zeros(0)], [], [], []
         for number, body in enumerate(bodies):
@@ -93,7 +93,7 @@ class Bodies:
         )
 
     def placed(self, centre: NDArray[np.float64], orientation: NDArray[np.float64]) -> NDArray[np.float64]:
-        """[..., P, 3] the points in the world, of centres [..., B, 3] and orientations [..., B, 3, 3]."""
+        """Mesh points [..., P, 3] in the world frame, for centres [..., B, 3] and orientations [..., B, 3, 3]."""
         turned = np.einsum("...pij,pj->...pi", orientation[..., self.body, :, :], self.points)
         return np.asarray(centre[..., self.body, :] + turned)
 

@@ -1,4 +1,4 @@
-"""A movable obstacle, as it is described."""
+"""Description of a rigid body that contact can move."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ Vector = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class RigidBody:
-    """A movable obstacle."""
+    """A rigid body that contact can move."""
 
     mesh: SurfaceMesh
-    """Closed, oriented outwards, in world coordinates at the start [m]."""
+    """Closed mesh with outward faces, in the world frame at the start [m]."""
     density: float = 1000.0
-    """[kg/m³]; without effect if `mass` is given."""
+    """Density [kg/m³]; not used if `mass` is given."""
     mass: float | None = None
-    """[kg]"""
+    """Mass [kg]; default density times volume."""
     velocity: Vector = (0.0, 0.0, 0.0)
-    """[m/s]"""
+    """Initial velocity of the centre of mass [m/s]."""
     angular_velocity: Vector = (0.0, 0.0, 0.0)
-    """[rad/s]"""
+    """Initial angular velocity in the world frame [rad/s]."""

@@ -1,8 +1,7 @@
-"""The forces that all integrators have, one file each; `term.py` says what a force is, `compiled.module` what is generated
-from it.
+"""Force terms that all integrators share, one file each.
 
-A new force is a file here and a line in `TERMS`. Each integrator adds its contact in a module of its own, such as
-`implicit.terms`.
+To add a force, write a file here and list it in `TERMS`. `term.py` defines what a term consists of. `compiled.module`
+generates kernels from it. Each integrator adds its contact terms in its own module, such as `implicit.terms`.
 """
 
 from importlib import import_module
@@ -20,4 +19,4 @@ TERMS: tuple[Term, ...] = tuple(
         "handles",
     )
 )
-"""Forces between nodes that are known before the motion."""
+"""Force terms whose elements are fixed before the simulation."""

@@ -2,9 +2,10 @@
 
     f = ρ_air a |u_n| v_n N + drag a v_t + linear a v,   v = v_wind - mean corner velocity
 
-with a the material-space area; a third of f acts on each corner. The speed u_n of the pressure is that before the step, the
-velocities it multiplies are those after it: drag then damps however light the cloth and however long the step. ARCSim takes
-all of it before the step (`lagged_air`), where a light cloth in dense air is thrown back harder than it came, and explodes.
+a is the area in material space. v_n and v_t are the normal and tangential parts of v, and N is the unit normal. A third of
+f acts on each corner. The speed u_n is v_n at the start of the step, but v is taken at its end. So drag damps for any mass
+and any step length. With `lagged_air`, v is taken at the start of the step, as in ARCSim. Light cloth in dense air is then
+unstable.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from diffcloud.sim.terms.term import Element, Elements, Setup, Term
 
 
 def force(face: Element) -> Sequence[Vector]:
-    """A third of f on each corner."""
+    """Force on each corner: a third of f [N]."""
     a, b, c = face.positions
     normal = cross(b - a, c - a)
     unit = normal / norm(normal)
@@ -35,7 +36,7 @@ def force(face: Element) -> Sequence[Vector]:
 
 
 def build(setup: Setup) -> Elements:
-    """All faces."""
+    """Elements: all faces."""
     mesh, surrounding = setup.mesh, setup.surrounding
     count = len(mesh.faces)
     return Elements(
@@ -56,4 +57,4 @@ TERM = Term(
     constants={"area": (), "wind": (3,), "lagged": ()},
     parameters={"air_density": "episode", "air_drag": "episode", "linear_drag": "episode"},
 )
-"""Constants: area in material space [m²]; velocity of the air [m/s]; 1 where velocities before the step count."""
+"""Constants: area in material space [m²]; air velocity [m/s]; 1 to use the velocities at the start of the step."""

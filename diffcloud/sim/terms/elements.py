@@ -1,4 +1,4 @@
-"""The elements of all terms in one system, for the kernels."""
+"""Collects the elements of all force terms of a system for the kernels."""
 
 from __future__ import annotations
 
@@ -13,13 +13,19 @@ from diffcloud.sim.terms.term import Elements, Setup, Term
 
 
 def elements(setup: Setup, terms: Sequence[Term], kernels: Any, bodies: int = 0) -> tuple[Any, Pattern]:
-    """(`kernels.Terms`, the pattern of the step matrix: cloth nodes, then the centre and the rotation of each body).
+    """Build the elements of all terms, and the sparsity pattern of the step's matrix.
+
+    The rows of the matrix are the cloth nodes, followed by the centre and the rotation of each body.
 
     Args:
-        terms, kernels: of an integrator.
+        terms, kernels: force terms of an integrator, and the kernels generated from them.
+        bodies: number of rigid bodies.
+
+    Returns:
+        The elements as `kernels.Terms`, and the pattern.
 
     Raises:
-        SceneError: the surrounding has settings of a force that there is not.
+        SceneError: the surroundings have settings for an unknown force.
     """
     names = [term.name for term in terms]
     for name in setup.surrounding.forces:
@@ -39,7 +45,7 @@ def elements(setup: Setup, terms: Sequence[Term], kernels: Any, bodies: int = 0)
 
 
 def _none(term: Term) -> Elements:
-    """A term that has nothing to act on."""
+    """Empty elements, for a term that does not act in this scene."""
     return Elements(
         np.zeros((0, term.corners), np.int64),
         {name: np.zeros((0, *shape)) for name, shape in term.constants.items()},

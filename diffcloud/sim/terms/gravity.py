@@ -1,4 +1,4 @@
-"""Weight: f = m g on each node. The air that moves with a cloth adds to its inertia, and not to m."""
+"""Weight: f = m g on each node. m excludes the added mass of the air."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from diffcloud.sim.terms.term import Element, Elements, Setup, Term
 
 
 def force(node: Element) -> Sequence[Vector]:
-    """m g."""
+    """Weight m g [N]."""
     return [node.parameter("weight") * node.vector("acceleration")]
 
 
 def build(setup: Setup) -> Elements:
-    """All nodes."""
+    """Elements: all nodes."""
     nodes = np.arange(len(setup.mesh.nodes))[:, None]
     return Elements(
         nodes, {"acceleration": np.tile(np.array(setup.surrounding.gravity, dtype=np.float64), (len(nodes), 1))}
@@ -31,4 +31,4 @@ TERM = Term(
     constants={"acceleration": (3,)},
     parameters={"weight": "corner"},
 )
-"""Constants: g [m/s²]."""
+"""Constants: gravitational acceleration g [m/s²]."""

@@ -1,14 +1,14 @@
-"""In-plane elasticity with the measured tables of Wang et al. 2011, as ARCSim samples them.
+"""In-plane elasticity with the measured tables of Wang et al. 2011, sampled as in ARCSim.
 
     energy per face = a [k0 E00²/2 + k1 E00 E11 + k2 E11²/2 + k3 E01²],   E = (FᵀF - I)/2,   k = k(E)
 
-with F [3, 2] the deformation gradient and a the material-space area. The coefficients are looked up trilinearly in a
-30³ grid over (E00, E11, |E01|). ARCSim samples with half-pixel centres and border padding (grid_sample with
-align_corners = False); with zero padding the resting stiffness would be halved. They are constants in force and stiffness,
-but their dependence on the strain does enter derivatives with respect to the state.
+F [3, 2] is the deformation gradient, and a the area in material space. The coefficients are interpolated trilinearly in a
+30³ grid over (E00, E11, |E01|). ARCSim samples with half-pixel centres and border padding (`grid_sample` with
+align_corners = False). Zero padding would halve the stiffness at rest. Force and stiffness treat the coefficients as
+constants. Derivatives with respect to the state include their dependence on the strain.
 
-The stiffness H takes the geometric term of tension only and drops the shear's (ARCSim), which keeps it positive. Of the
-displacement d = (Δt + β) v of a damped step, that term takes Δt v alone: with β v it would damp rotations.
+The stiffness H includes the geometric term of tension, but not that of shear, as in ARCSim. This keeps H positive. In a
+damped step the displacement is d = (Δt + β) v. The geometric term uses Δt v only, because β v would damp rotations.
 """
 
 from __future__ import annotations
@@ -24,14 +24,14 @@ from diffcloud.sim.terms.term import Element, Elements, Setup, Term
 
 _SAMPLES = 30
 _SCALE = 900.0 / 29.0
-"""Grid cells per unit of strain: a range factor 60/29 in grid_sample's coordinates."""
+"""Grid cells per unit of strain. In `grid_sample` coordinates the range factor is 60/29."""
 
 Symmetric = tuple[Scalar, Scalar, Scalar]
 """Components 00, 11 and 01 of a symmetric tensor."""
 
 
 def force(face: Element) -> Sequence[Vector]:
-    """-∂W/∂x - H d on the three corners."""
+    """Forces -∂W/∂x - H d on the three corners [N]."""
     xu, xv = along_material(face, face.positions)
     du, dv = along_material(face, face.displacement)
     along_u, along_v = along_material(face, [face.ahead * velocity for velocity in face.after])
@@ -47,7 +47,7 @@ def force(face: Element) -> Sequence[Vector]:
 
 
 def energy(face: Element) -> Scalar:
-    """W"""
+    """Energy W of the face [J]."""
     e00, e11, e01 = strain(*along_material(face, face.positions))
     k0, k1, k2, k3 = coefficients(face, e00, e11, e01)
     axial = 0.5 * (k0 * e00 * e00 + k2 * e11 * e11) + k1 * e00 * e11
@@ -55,7 +55,7 @@ def energy(face: Element) -> Scalar:
 
 
 def build(setup: Setup) -> Elements:
-    """The faces, with their rest shapes and the sampled table."""
+    """Elements: all faces, with their rest shapes and the sampled table."""
     mesh = setup.mesh
     return Elements(
         nodes=mesh.faces,
@@ -74,12 +74,15 @@ TERM = Term(
     tables={"cells": 3},
     parameters={"stretching": "element", "shear": "episode"},
 )
-"""Constants: area in material space [m²]; inverse of its edge matrix [1/m], row i of edge i, column of direction u or v.
-Tables: [29³, 8, 4] trilinear polynomial (x, y, z, xy, xz, yz, xyz, 1) of (k0, k1, k2, k3) in each cell [N/m]."""
+"""Constants: area in material space [m²]; inverse of the edge matrix [1/m], with a row per edge and a column per direction
+(u, v).
+
+Tables: [29³, 8, 4] trilinear polynomial (x, y, z, xy, xz, yz, xyz, 1) of (k0, k1, k2, k3) in each cell [N/m].
+"""
 
 
 def along_material(face: Element, field: Sequence[Vector]) -> tuple[Vector, Vector]:
-    """Derivatives of a field of the corners along u and v."""
+    """Derivatives along u and v of a field given at the three corners."""
     first, second = field[1] - field[0], field[2] - field[0]
     u, v = (
         face.constant("inverse_rest", 0, axis) * first + face.constant("inverse_rest", 1, axis) * second for axis in (0, 1)
@@ -114,7 +117,7 @@ def on_corners(face: Element, row_u: Vector, row_v: Vector) -> Sequence[Vector]:
 
 
 def coefficients(face: Element, e00: Scalar, e11: Scalar, e01: Scalar) -> list[Scalar]:
-    """k0, k1, k2, k3 at a strain [N/m], times the face's multiplier, and k3 times that of shear."""
+    """Coefficients k0, k1, k2, k3 at a strain [N/m], multiplied by the face's `stretching`, and k3 also by `shear`."""
     places = [clamped((e + 0.25) * _SCALE - 0.5, 0.0, _SAMPLES - 1.0) for e in (e00, e11)]
     places.append(clamped(absolute(e01) * _SCALE - 0.5, 0.0, _SAMPLES - 1.0))
     last = _SAMPLES - 2.0
@@ -133,7 +136,7 @@ def coefficients(face: Element, e00: Scalar, e11: Scalar, e01: Scalar) -> list[S
 
 
 def _sampled(stretching: NDArray[np.float64]) -> NDArray[np.float64]:
-    """[6, 4] table -> [4, 30, 30, 30] coefficients over (C00, C11, C01), C = FᵀF."""
+    """Sample the table [6, 4] to coefficients [4, 30, 30, 30] over (C00, C11, C01), where C = FᵀF."""
     index = np.arange(_SAMPLES)
     c00, c11, c01 = np.meshgrid(0.5 + index / 15, 0.5 + index / 15, index / 15, indexing="ij")
     largest = 0.5 * (c00 + c11 + np.sqrt(4 * c01**2 + (c00 - c11) ** 2))
@@ -154,7 +157,7 @@ def _sampled(stretching: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _cell_polynomials(table: NDArray[np.float64]) -> NDArray[np.float64]:
-    """[K, n, n, n] -> [(n-1)³, 8, K]: each cell's trilinear polynomial in its local coordinates."""
+    """Trilinear polynomial of each cell in its local coordinates: [K, n, n, n] -> [(n-1)³, 8, K]."""
     ends = (slice(None, -1), slice(1, None))
     c = {(x, y, z): table[:, ends[x], ends[y], ends[z]] for x in (0, 1) for y in (0, 1) for z in (0, 1)}
     polynomial = [

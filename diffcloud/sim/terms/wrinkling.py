@@ -1,27 +1,26 @@
-"""What wrinkles finer than the mesh take off the energy that `stretching` stores in compression.
+"""Reduction of the compression energy of `stretching` by wrinkles that are finer than the mesh.
 
     energy per face = (1 - c) a [W*(E) - W(E)],   W(E) = E:C:E / 2,   W*(E) = min over slack A ⪰ 0 of W(E + A)
 
-with E the Green strain and C the stiffness as `stretching` has them, a the material-space area, and c in [0, 1] the part
-of the stiffness that resists compression all the same (`Material.compression`). A is the slack that wrinkles take up. W*
-is the relaxed energy of tension fields (Wagner 1929; Pipkin, The relaxed energy density for isotropic elastic membranes,
-IMA J. Appl. Math. 36, 1986), for any C. Its stress is the one nearest to C:E, measured by C⁻¹, that has no compression in
-it:
+E is the Green strain and C the stiffness, as in `stretching`. a is the area in material space. c in [0, 1] is the fraction
+of the stiffness that still resists compression (`Material.compression`). A is the slack that wrinkles absorb. W* is the
+relaxed energy of tension fields, for any C (Wagner 1929; Pipkin, The relaxed energy density for isotropic elastic
+membranes, IMA J. Appl. Math. 36, 1986). Its stress is the closest one to C:E, in the norm of C⁻¹, without compression:
 
     taut        C:E ⪰ 0     W* = W
     slack       E ⪯ 0       W* = 0
     wrinkled    otherwise   W* = max over directions t with e > 0 of e²/2y,   stress (e/y) t tᵀ
 
-with e = t·E·t the strain along t, and 1/y Young's modulus there: y = t tᵀ : C⁻¹ : t tᵀ. Cloth that is pulled in one
-direction and free to narrow has no compression in its stress, and pulls as with `stretching` alone.
+where e = t·E·t is the strain along t, and 1/y is Young's modulus there: y = t tᵀ : C⁻¹ : t tᵀ. Cloth that is pulled in one
+direction and free to narrow has no compressive stress. Its force is that of `stretching` alone.
 
-Where a face becomes slack, or begins to wrinkle, the second derivatives of W* jump, and Newton's method oscillates.
-Two functions of the energies ease the jumps and keep the energy convex, so that the sum with `stretching` has a positive
-matrix. For the sheet at rest to be taut, E is the strain plus `_BEGINS` in all directions: compression up to
-that strain is resisted in full, and beyond it about 1.5 times the stress at that strain remains.
+The second derivatives of W* jump where a face becomes slack or begins to wrinkle, so Newton's method would oscillate. Two
+functions of the energies smooth these jumps. They keep the energy convex, so the sum with `stretching` has a positive
+matrix. The sheet at rest must be taut, so E is the strain plus `_BEGINS` in all directions. Compression up to this strain
+meets full resistance. Beyond it, about 1.5 times the stress at this strain remains.
 
-Together with `stretching`, damping has the stiffness c C, whatever state a face is in. With the second derivatives of the
-energy, the damping forces themselves would jump where a face becomes slack or taut, and steps would often not converge.
+Together with `stretching`, damping always has the stiffness c C. With the second derivatives of the energy, the damping
+forces themselves would jump where a face becomes slack or taut, and steps would often not converge.
 """
 
 from __future__ import annotations
@@ -44,19 +43,19 @@ from diffcloud.sim.terms.term import Element, Elements, Setup, Term
 _BEGINS = 5e-4
 """Compressive strain at which wrinkles begin."""
 _COUPLED = 0.999
-"""Part of √(k0 k2) that k1 counts for at most, so that C is positive."""
+"""Upper bound of k1 as a fraction of √(k0 k2), so that C is positive."""
 _LEAST = 1e-9
-"""Part of k0 + k2 that is added to k0, k2 and k3, for the same reason."""
+"""Fraction of k0 + k2 that is added to k0, k2 and k3, so that C is positive."""
 _STEPS = 6
-"""Of Newton's method, to the direction of wrinkles from that of the largest strain. In 100,000 random strains of sheets
-with k3 from 0.3 to 4000 % of √(k0 k2), and k0 and k2 apart by factors of up to thirty, they always arrived."""
+"""Iterations of Newton's method from the direction of the largest strain to that of the wrinkles. They converged for
+100,000 random strains of sheets with k3 from 0.3 to 4000 % of √(k0 k2), and ratios k0/k2 up to thirty."""
 _WIDEST = 1.0
-"""Largest tangent of a step, in twice the direction's angle."""
+"""Upper bound of a Newton step: tangent of the change of twice the direction's angle."""
 _TINY = 1e-24
 
 
 def force(face: Element) -> Sequence[Vector]:
-    """-∂W/∂x - H d on the three corners, with C in the place of the second derivatives in H for what damps."""
+    """Forces -∂W/∂x - H d on the three corners [N]. For damping, H has C in place of the second derivatives."""
     xu, xv = along_material(face, face.positions)
     ahead = strain_change(xu, xv, *along_material(face, [face.ahead * velocity for velocity in face.after]))
     whole = strain_change(xu, xv, *along_material(face, face.displacement))
@@ -68,13 +67,13 @@ def force(face: Element) -> Sequence[Vector]:
 
 
 def energy(face: Element) -> Scalar:
-    """(1 - c) a (W* - W)"""
+    """Energy (1 - c) a (W* - W) [J]."""
     sheet = _Wrinkling(face, *along_material(face, face.positions))
     return face.constant("area") * (face.parameter("compression") - 1.0) * sheet.energy()
 
 
 def build(setup: Setup) -> Elements | None:
-    """The faces, where compression is not resisted in full."""
+    """Elements: all faces, if the material wrinkles."""
     return stretching.build(setup) if setup.material.wrinkles else None
 
 
@@ -88,11 +87,11 @@ TERM = Term(
     tables=stretching.TERM.tables,
     parameters={**stretching.TERM.parameters, "compression": "episode"},
 )
-"""Constants and tables: those of `stretching`."""
+"""Constants and tables as in `stretching`."""
 
 
 class _Wrinkling:
-    """What a face gives up by wrinkling, W - W* as it is eased, and its derivatives by the strain."""
+    """Smoothed energy W - W* that a face loses by wrinkling, and its derivatives with respect to the strain."""
 
     def __init__(self, face: Element, xu: Vector, xv: Vector) -> None:
         along_u, along_v, across = strain(xu, xv)
@@ -111,7 +110,7 @@ class _Wrinkling:
         self._lost = lost = _combined(1.0, whole, -1.0, self._kept)
         energy = 0.5 * _double(strained, whole)
         kept = where(self._taut, energy, where(self._slack, 0.0, self._pulled.energy()))
-        given_up = 0.5 * _double(lost, stress(compliance, lost))  # energy - kept, without what would cancel
+        given_up = 0.5 * _double(lost, stress(compliance, lost))  # energy - kept, computed without cancellation
         self._scale = 0.25 * _BEGINS * _BEGINS * (k0 + k2) + _TINY
         self._slackening = _Slackening(squareroot(kept / self._scale + _TINY))
         self._loss = _Loss(squareroot(given_up / self._scale + _TINY))
@@ -123,7 +122,7 @@ class _Wrinkling:
         return _combined(self._slackening.share, self._kept, self._loss.share, self._lost)
 
     def change(self, by: Symmetric) -> Symmetric:
-        """Of the stress by a change of the strain."""
+        """Change of the stress for a change of the strain `by`."""
         whole = stress(self.stiffness, by)
         kept = self._relaxed(whole, self._pulled.change(by))
         shares = _combined(self._slackening.share, kept, self._loss.share, _combined(1.0, whole, -1.0, kept))
@@ -134,7 +133,7 @@ class _Wrinkling:
         return _combined(1.0, shares, 1.0, _combined(slackens, self._kept, loses, self._lost))
 
     def _relaxed(self, whole: Symmetric, pulled: Symmetric) -> Symmetric:
-        """By whether the face is taut, slack or wrinkled."""
+        """Select the stress of a taut, slack or wrinkled face."""
         first, second, third = (
             where(self._taut, one, where(self._slack, 0.0, other)) for one, other in zip(whole, pulled, strict=True)
         )
@@ -142,9 +141,9 @@ class _Wrinkling:
 
 
 class _Slackening:
-    """r²(1 - r)³ below r = 1, taken from r², the energy that is kept: what is left rises from zero without a jump of its
-    second derivative, is convex, and meets r² at 1 with two derivatives. `share` is the derivative by r², `rate` the
-    derivative of `share` by r, divided by r."""
+    """r²(1 - r)³ for r < 1: the part of the kept energy r² that smoothing subtracts. The difference is convex, and its
+    second derivative rises from zero without a jump. At r = 1 it joins r² with two continuous derivatives. `share` is the
+    derivative with respect to r². `rate` is the derivative of `share` with respect to r, divided by r."""
 
     def __init__(self, root: Scalar) -> None:
         r = where(root < 1.0, root, 1.0)
@@ -155,8 +154,8 @@ class _Slackening:
 
 
 class _Loss:
-    """The part that is lost of q², the energy beyond what is kept: its second derivative by q grows from 0 to 2 up to
-    q = 1. `share` and `rate` as of `_Slackening`."""
+    """Smoothed lost energy: the part of q² that is subtracted, where q² is the energy beyond the kept one. Its second
+    derivative with respect to q grows from 0 to 2 up to q = 1. `share` and `rate` are as in `_Slackening`."""
 
     def __init__(self, root: Scalar) -> None:
         q, eased = root, root < 1.0
@@ -166,11 +165,8 @@ class _Loss:
 
 
 class _Pulled:
-    """A face that pulls along its wrinkles alone, in the direction t of the largest e²/2y.
-
-    Args:
-        compliance: of C⁻¹, as k0, k1, k2, k3 are of C.
-    """
+    """Energy and stress of a wrinkled face: tension only in the direction t of the largest e²/2y. `compliance` has the
+    coefficients of C⁻¹, in the order of k0, k1, k2, k3."""
 
     def __init__(self, strained: Symmetric, compliance: Sequence[Scalar]) -> None:
         found = [held(one) for one in strained], [held(one) for one in compliance]
@@ -180,22 +176,22 @@ class _Pulled:
             rises = at.bend < 0.0
             step = where(rises, at.slope / where(rises, -at.bend, 1.0), where(at.slope > 0.0, _WIDEST, -_WIDEST))
             turn = _turned(*turn, clamped(step, -_WIDEST, _WIDEST))
-        bend = _Along(*turn, *found).bend  # one step more, by which the direction follows the strain
+        bend = _Along(*turn, *found).bend  # one more step, through which the direction depends on the strain
         step = _Along(*turn, strained, compliance).slope / where(bend < 0.0, -bend, 1.0)
         self._at = _Along(*_turned(*turn, step), strained, compliance)
 
     def energy(self) -> Scalar:
-        """e²/2y"""
+        """Energy per area e²/2y."""
         return 0.5 * self._at.strain * self._at.strain / self._at.compliance
 
     def stress(self) -> Symmetric:
-        """(e/y) t tᵀ"""
+        """Stress (e/y) t tᵀ."""
         pull = self._at.strain / self._at.compliance
         along_u, along_v, between = self._at.tensor
         return pull * along_u, pull * along_v, pull * between
 
     def change(self, by: Symmetric) -> Symmetric:
-        """Of the stress by a change of the strain: t pulls more, and turns."""
+        """Change of the stress for a change of the strain: the tension increases, and t rotates."""
         at = self._at
         slopes = [at.compliance * one - 0.5 * at.softer * other for one, other in zip(at.turning, at.tensor, strict=True)]
         bend = at.compliance * at.compliance * where(at.bend < 0.0, -at.bend, 1.0)
@@ -205,10 +201,8 @@ class _Pulled:
 
 
 class _Along:
-    """A direction t = (cos φ, sin φ) in the sheet, by the cosine and sine of 2φ, in which t tᵀ is linear.
-
-    Derivatives are by 2φ. That of e²/2y is (e/y²) `slope`, and `slope`'s is `bend`.
-    """
+    """A direction t = (cos φ, sin φ) in the sheet, given by cos 2φ and sin 2φ, in which t tᵀ is linear. Derivatives are
+    with respect to 2φ. The derivative of e²/2y is (e/y²) `slope`, and the derivative of `slope` is `bend`."""
 
     def __init__(self, cosine: Scalar, sine: Scalar, strained: Sequence[Scalar], compliance: Sequence[Scalar]) -> None:
         along_u, along_v, between = 0.5 + 0.5 * cosine, 0.5 - 0.5 * cosine, 0.5 * sine
@@ -228,7 +222,7 @@ class _Along:
 
 
 def _of_the_largest(along_u: Scalar, along_v: Scalar, across: Scalar) -> tuple[Scalar, Scalar]:
-    """Cosine and sine of twice the angle of the largest strain."""
+    """Cosine and sine of twice the angle of the direction of the largest strain."""
     difference = 0.5 * (along_u - along_v)
     radius = squareroot(difference * difference + across * across)
     directed = radius > 0.0
@@ -242,11 +236,11 @@ def _turned(cosine: Scalar, sine: Scalar, tangent: Scalar) -> tuple[Scalar, Scal
 
 
 def _double(one: Sequence[Scalar], other: Sequence[Scalar]) -> Scalar:
-    """one : other"""
+    """Double contraction one : other."""
     return one[0] * other[0] + one[1] * other[1] + 2.0 * one[2] * other[2]
 
 
 def _combined(a: Scalar | float, one: Symmetric, b: Scalar | float, other: Symmetric) -> Symmetric:
-    """a one + b other"""
+    """Linear combination a one + b other."""
     first, second, third = (a * p + b * q for p, q in zip(one, other, strict=True))
     return first, second, third
