@@ -1,7 +1,5 @@
-"""Settings of a fit: one field for each, from which options, params.yaml, records and the page of settings are made.
-
-Nothing here imports torch, so that help is quick.
-"""
+"""Settings of a fit. Command options, params.yaml, records and the page of settings are made from these fields. Nothing
+here imports torch, so that `--help` is fast."""
 
 from __future__ import annotations
 
@@ -18,10 +16,10 @@ if TYPE_CHECKING:
     from diffcloud.scene.scenarios import Scenario
 
 LEVEL = 0.9
-"""Of intervals."""
+"""Default probability of the intervals."""
 IDENTIFIED_FACTOR = 2.0
 SMOOTHING = 0.5
-"""Default of adam's."""
+"""Default `smoothing` of adam."""
 _Starts = Annotated[int, Field(ge=1, le=MOST_STARTS)] | None
 
 
@@ -71,11 +69,11 @@ Solver = Annotated[_Block, Field(discriminator="name")]
 SOLVER_KINDS: dict[str, type[Section]] = {
     name: kind for kind in get_args(_Block) for name in get_args(kind.model_fields["name"].annotation)
 }
-"""Name -> its settings."""
+"""Solver name -> settings class."""
 
 
 class FitSettings(Section):
-    """Of a fit."""
+    """Settings of a fit."""
 
     parameters: Names = ["stretching", "density"]
     """Parameters to find, comma-separated, such as stretching,bending,density."""
@@ -114,7 +112,7 @@ class FitSettings(Section):
     @field_validator("solver", mode="before")
     @classmethod
     def _named(cls, solver: Any) -> Any:
-        """A name alone stands for that solver with its defaults."""
+        """Replace a solver's name by its default settings."""
         if isinstance(solver, str):
             solver = {"name": solver}
         if not isinstance(solver, dict):
@@ -127,7 +125,7 @@ class FitSettings(Section):
     @field_validator("bounds", "fixed", mode="before")
     @classmethod
     def _given(cls, values: Any) -> Any:
-        """null stands for a parameter that has none of its own."""
+        """Drop entries that are null, so that the default applies."""
         return {name: value for name, value in values.items() if value is not None} if isinstance(values, dict) else values
 
     @model_validator(mode="after")
@@ -159,14 +157,14 @@ class FitSettings(Section):
         return self.loss == "paper"
 
     def measure(self) -> dict[str, Any]:
-        """Keyword arguments of `Objective`."""
+        """Return the keyword arguments of `Objective`."""
         from diffcloud.estimation.pose import parse_priors
 
         priors = None if self.alignment is None else parse_priors(self.alignment)
         return {"paper": self.paper, "nuisance": priors, "frames": self.frames, "points": self.points, "seed": self.seed}
 
     def known_within(self, scenarios: Sequence[Scenario]) -> dict[str, float]:
-        """Material that is not known exactly in a fit of recordings in these scenarios -> factor of one deviation."""
+        """Return the uncertain material of a fit in these scenarios -> standard deviation as a factor."""
         from diffcloud.estimation.uncertain import MATERIAL_UNCERTAINTY
         from diffcloud.scene.scenarios.uncertain import parse_uncertain
 
@@ -184,8 +182,8 @@ class FitSettings(Section):
         }
 
     def initial_state_within(self, scenarios: Sequence[Scenario]) -> list[dict[str, float]]:
-        """How the cloth may lie otherwise at the start of each recording, in one fit of recordings in these scenarios: name
-        of `estimation.initial_state` -> standard deviation [rad, m, 1]."""
+        """Return the initial-state variables of each recording in one fit: name -> standard deviation [rad, m, 1].
+        `estimation.initial_state` explains the names."""
 
         from diffcloud.scene.scenarios.initial_state import parse_initial_state
 
@@ -194,14 +192,14 @@ class FitSettings(Section):
         return [dict(one.initial_state) if self._fits_more(scenarios) else {} for one in scenarios]
 
     def _fits_more(self, scenarios: Sequence[Scenario]) -> bool:
-        """Whether nuisance variables are fitted by default: where derivatives make that cheap."""
+        """Return whether nuisance variables are fitted by default, i.e. whether derivatives make them cheap."""
         from diffcloud.sim.integrators import load_integrator
 
         smooth = all(load_integrator(one.scene.integrator).smooth for one in scenarios)
         return self.solver.name == "likelihood" and smooth
 
     def solver_settings(self, scenario: Scenario) -> Settings:
-        """Of the solver, with what the scenario says where nothing is given."""
+        """Return the solver's settings, with the scenario's values as defaults."""
         from diffcloud.estimation.solvers import SOLVERS
 
         given: dict[str, Any] = {"seed": self.seed}
