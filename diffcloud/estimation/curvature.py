@@ -15,7 +15,7 @@ class Surfaces(NamedTuple):
     one if all motions or frames share them."""
 
     nodes: Floats
-    """[B, L, V, 3]"""
+    """[B, L, V, 3] node positions."""
     velocities: Floats
     """[B, L, V, 3], or empty without velocities."""
 
@@ -25,19 +25,19 @@ class Placements(NamedTuple):
     (`estimation.pose`)."""
 
     centre: Floats
-    """[3]"""
+    """[3] centre of the recording."""
     matrix: Floats
-    """[B, 3, 3]"""
+    """[B, 3, 3] scaled rotations."""
     shift: Floats
-    """[B, 3]"""
+    """[B, 3] shifts, including the centre."""
     lag: Floats
-    """[B, C]"""
+    """[B, C] lag of each clock relative to its stated offset [s]."""
     matrix_rates: Floats
-    """[d, B, 3, 3]"""
+    """[d, B, 3, 3] derivatives of `matrix`."""
     shift_rates: Floats
-    """[d, 3]"""
+    """[d, 3] derivatives of `shift`."""
     lag_rates: Floats
-    """[d, C]"""
+    """[d, C] derivatives of `lag`."""
 
 
 class Partners(NamedTuple):

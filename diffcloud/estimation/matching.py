@@ -153,7 +153,7 @@ class Recorded:
     """Q recorded points per frame that are paired with the cloth, for L frames, ordered by clock."""
 
     points: Tensor
-    """[L, Q, 3]"""
+    """[L, Q, 3] points in the recording's frame."""
     sure: Tensor
     """[L, Q] weight of each point."""
     counts: tuple[int, ...]

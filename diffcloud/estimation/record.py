@@ -60,7 +60,7 @@ class RecordingFit(_Model):
     name: Text
     scenario: Text
     loss: NonNegative
-    """[squared length unit of the scenario]"""
+    """Loss of this recording [squared length unit of the scenario]."""
     rms_mm: NonNegative
     rms_to_recording_mm: NonNegative
     """RMS distance from the cloth to the recorded points."""
@@ -143,11 +143,11 @@ class WholeMaterial(_Model):
     friction: Friction
     self_friction: Friction
     air_density: NonNegative
-    """[kg/m³]"""
+    """[kg/m³] density of the air."""
     added_mass: NonNegative
     """[kg/m²] mass of the air that moves with the cloth, mean over the cloth."""
     linear_drag: NonNegative
-    """[kg/(m²·s)]"""
+    """[kg/(m²·s)] drag of the air per area that is linear in speed."""
 
 
 class Measure(_Model):
@@ -170,9 +170,9 @@ class History(_Model):
     names: list[Text]
     """[k] names of the variables."""
     loss: list[list[NonNegative | None]]
-    """[N][B]"""
+    """[N][B] losses."""
     values: list[list[list[Value | None]]]
-    """[N][B][k]"""
+    """[N][B][k] values."""
     gradient_norm: list[list[NonNegative | None]]
     """[N][B]; empty for a search."""
 

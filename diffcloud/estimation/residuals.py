@@ -34,7 +34,7 @@ class Axis:
     """[k] lower bounds of the values."""
     high: Tensor
     logarithmic: Tensor
-    """bool [k]"""
+    """bool [k], whether the coordinate is the logarithm."""
     zero: Tensor
     """[k] value at coordinate 0, for variables that are not logarithmic."""
     scale: Tensor

@@ -57,9 +57,9 @@ class FittedMotion:
     start_nodes: NDArray[np.float64]
     """[T + 1, V, 3] cloth nodes with the parameters of the first start, at their best pose."""
     faces: NDArray[np.int64]
-    """[F, 3]"""
+    """[F, 3] faces of the cloth."""
     times: NDArray[np.float64]
-    """[T + 1] [s]"""
+    """[T + 1] times of the frames [s]."""
     bodies: SurfaceMesh
     """Fixed bodies other than tables."""
     held: NDArray[np.int64]

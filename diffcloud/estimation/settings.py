@@ -24,44 +24,45 @@ _Starts = Annotated[int, Field(ge=1, le=MOST_STARTS)] | None
 
 
 class LikelihoodSolver(Section):
-    """Likeliest parameters and their uncertainty: a variance for each frame, a horizon, a correction by a finer mesh."""
+    """Most likely parameters with intervals. Each frame has its own variance, a horizon limits the frames, and a
+    refined mesh corrects the motion."""
 
     name: Literal["likelihood"] = "likelihood"
     max_steps: Count | None = None
-    """Steps of a start at most. Default: 12."""
+    """Maximum number of steps of a start. Default: 12."""
     starts: _Starts = None
-    """Descents from different places. Default: 3."""
+    """Number of descents, each from another start. Default: 3."""
     model_error: bool = True
     """Whether cloth and simulator may differ. False for recordings that this simulator made on this mesh."""
 
 
 class AdamSolver(Section):
-    """The paper's: descent along the gradient of the loss. It gives no intervals."""
+    """The paper's solver: gradient descent on the loss. It gives no intervals."""
 
     name: Literal["adam"] = "adam"
     max_steps: Count | None = None
-    """Steps at most. Default: 50."""
+    """Maximum number of steps. Default: 50."""
     starts: _Starts = None
-    """Descents from different places. Default: 1."""
+    """Number of descents, each from another start. Default: 1."""
     learning_rate: Positive | None = None
-    """Default: the scenario's."""
+    """Learning rate of Adam. Default: the scenario's."""
     smoothing: NonNegative | None = None
-    """Standard deviation, on the sigmoid's axis, of perturbed copies of the first start, whose gradients are averaged.
+    """Standard deviation, before the sigmoid, of perturbed copies of the first start, whose gradients are averaged.
     Default: 0.5; 0: the plain gradient, as in the paper."""
     resample: bool | None = None
-    """New points in each step, as in the published scripts. Default: the same points."""
+    """Sample new points in each step, as in the published scripts. Default: the same points."""
     threshold: NonNegative | None = None
-    """Loss below which the descent stops. Default: never; of `loss: paper`, the scenario's."""
+    """Loss below which the descent stops. Default: never; with `loss: paper`, the scenario's."""
 
 
 class SearchSolver(Section):
-    """A search without derivatives: CMA-ES, or uniform draws. It gives no intervals."""
+    """A search without derivatives: CMA-ES, or uniform random samples. It gives no intervals."""
 
     name: Literal["cma_es", "random_search"] = "cma_es"
     max_simulations: Count | None = None
-    """Simulations at most. Default: 200."""
+    """Maximum number of simulations. Default: 200."""
     threshold: NonNegative | None = None
-    """Loss below which the search stops. Default: never; of `loss: paper`, the scenario's."""
+    """Loss below which the search stops. Default: never; with `loss: paper`, the scenario's."""
 
 
 _Block = LikelihoodSolver | AdamSolver | SearchSolver
@@ -84,26 +85,26 @@ class FitSettings(Section):
     solver: Solver = LikelihoodSolver()
     """likelihood, with intervals; adam, the paper's; cma_es or random_search, without derivatives."""
     points: Count | None = None
-    """Points that are sampled on the cloth in each frame. Default: the scene's."""
+    """Number of points sampled on the cloth in each frame. Default: the scene's."""
     frames: Annotated[list[Annotated[int, Field(ge=-100_000, le=100_000)]], Field(min_length=1)] | None = None
     """Frames to compare, such as 0,5,10. Default: all usable ones."""
     seed: Seed = 0
-    """Of all random numbers."""
+    """Seed of all random numbers."""
     loss: Literal["surface", "paper"] = "surface"
     """surface: both directions, all frames. paper: from cloth to recording only, squared, at the scene's loss frames."""
     alignment: Name | None = None
-    """Parts of the recording's pose and clock to find, with their standard deviation: x=2cm,yaw=5deg,lag=50ms. Of x, y, z,
-    tilt_x, tilt_y, yaw, lag, scale; or none. Default: all but scale."""
+    """Pose variables to estimate, each with its prior standard deviation: x=2cm,yaw=5deg,lag=50ms. Of x, y, z, tilt_x,
+    tilt_y, yaw, lag, scale; or none. Default: all but scale."""
     initial_state: Name | None = None
-    """How the cloth may lie at first: turn=5deg, shape=5mm, size=2%, track=2%; or none. Default: what the scene says, for
-    likelihood with a smooth integrator."""
+    """Deviations from the initial state to estimate, each with its prior standard deviation: turn=5deg, shape=5mm,
+    size=2%, track=2%; or none. Default: what the scene says, for likelihood with a smooth integrator."""
     prior: Name | None = None
-    """The factor within which each multiplier probably lies, such as bending=3x; or none. Default: 10x."""
+    """Prior standard deviation of each multiplier as a factor, such as bending=3x; or none. Default: 10x."""
     uncertain: Name | None = None
-    """Other material that is fitted too, each within a factor: bending=1.5x,air_density=1.3x; or none. Default: the
-    scene's, for likelihood with a smooth integrator."""
+    """Nuisance material to estimate too, each with its prior standard deviation as a factor:
+    bending=1.5x,air_density=1.3x; or none. Default: the scene's, for likelihood with a smooth integrator."""
     joint: bool = False
-    """One parameter set for all recordings, of one cloth."""
+    """Fit one parameter set to all recordings, of one cloth."""
     level: Level = LEVEL
     """Probability of the intervals."""
     identified_factor: Factor = IDENTIFIED_FACTOR

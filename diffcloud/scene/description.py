@@ -25,10 +25,10 @@ class Scene:
     material: Material
     handles: Handles
     frame_time: float
-    """[s]"""
+    """Time between frames [s]."""
     frame_steps: int = 1
     end_time: float = math.inf
-    """[s]"""
+    """End of the simulation [s]."""
     surrounding: Surrounding = field(default_factory=Surrounding)
     mass_material: Material | None = None
     """Material for the node masses, if it differs from `material` (see `arcsim.load.load_scene`)."""
@@ -42,7 +42,7 @@ class Scene:
 
     @property
     def time_step(self) -> float:
-        """[s]"""
+        """Duration of a simulation step [s]."""
         return self.frame_time / self.frame_steps
 
     @property

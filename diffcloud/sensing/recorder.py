@@ -93,9 +93,9 @@ class ClothMotion:
     nodes: Floats
     """[T, V, 3] nodes at each frame."""
     faces: NDArray[np.int64]
-    """[F, 3]."""
+    """[F, 3] faces of the cloth."""
     times: Floats
-    """[T] [s]."""
+    """[T] times of the frames [s]."""
     grasped: Sequence[int]
     """Nodes whose mean position the gripper follows."""
     table_height: float = 0.0

@@ -113,7 +113,7 @@ class Refinement:
 
 @dataclass(frozen=True)
 class _Rows:
-    """Linearised residuals."""
+    """Linearised residuals with their standard deviations."""
 
     J: Floats
     """[N, 6] derivatives with respect to a camera's rotation and translation. [N, 7 + L] has those of the clock offset
@@ -172,7 +172,7 @@ def refine_extrinsics(
         ]
     )
     found = np.zeros(len(prior))
-    """Corrections of the poses (the first camera's also moves all others) and of the lag, then the skins."""
+    """Corrections of the poses, the clock offset and the skins. That of the first camera also moves all others."""
     free, together, lag_variance = np.arange(len(prior)), np.eye(4), 0.0
     surface, thickened = arm, np.zeros(links)
     for iteration in range(_ITERATIONS):
@@ -243,9 +243,9 @@ class _Images:
 
     view: View
     depth_m: Floats
-    """[F, h, w]."""
+    """[F, h, w] z-depth [m]."""
     times: Floats
-    """[F] [s]."""
+    """[F] times of the images [s]."""
 
 
 def _thinned(raw: RawEpisode, name: str, view: View, frames: Sequence[int]) -> _Images:

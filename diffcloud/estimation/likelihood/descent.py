@@ -45,7 +45,7 @@ class Answer:
     """[K] fit coordinates of the space, then the pose of each recording and the grasp size if unknown, the latter two
     in standard deviations of their priors."""
     covariance: Tensor
-    """[K, K]"""
+    """[K, K] covariance of the variables."""
     sources: Mapping[str, Tensor]
     """Source of uncertainty -> its contribution to the covariance [K, K]."""
     energy: float

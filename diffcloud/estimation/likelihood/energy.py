@@ -32,7 +32,7 @@ _EDGE = 1e-6
 
 
 class Likelihood:
-    """Φ of all recordings."""
+    """Objective Φ of all recordings, with its variables and their priors."""
 
     def __init__(
         self, objectives: Sequence[Objective], space: FitSpace, settings: LikelihoodSettings, grip: float = 0.0

@@ -27,7 +27,7 @@ class Progress:
     values: Mapping[str, float]
     """Values of the best iterate so far."""
     simulations: int | None = None
-    """Simulations so far, which count towards the budget of a search; None for other solvers."""
+    """Number of simulations so far, which the budget of a search limits; None for other solvers."""
 
 
 @dataclass

@@ -51,7 +51,7 @@ class Chain:
     cameras: dict[str, Floats]
     """[4, 4] T_world_camera of each camera."""
     board: Floats
-    """[4, 4] T_gripper_board."""
+    """[4, 4] pose of the board on the gripper, T_gripper_board."""
     covariance: dict[str, Floats]
     """[6, 6] for each camera: translation [m] and rotation [rad], as left perturbations in the world."""
     board_size: Estimate | None = None
@@ -123,7 +123,7 @@ class _Standing:
     placed: dict[str, Floats]
     """T_world_camera of each camera."""
     board: Floats
-    """T_gripper_board."""
+    """Pose of the board on the gripper, T_gripper_board."""
     factors: Floats | None
 
     @property
