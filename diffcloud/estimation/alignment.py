@@ -19,11 +19,8 @@ _DAMPING = 1e-6
 
 def aligned(space: PoseSpace, start: Tensor, terms: Terms, caps: Sequence[float]) -> Tensor:
     """Return poses [B, d] after one Gauss–Newton step from `start` [B, d] for each factor of the distance cap in
-    `caps`.
-
-    A batch entry stops early if the factor is 1 and its step is small. The scale is held fixed while the factor is not
-    1, because shrinking the scene would otherwise make up for a position error.
-    """
+    `caps`. A batch entry stops early if the factor is 1 and its step is small. The scale is held fixed while the factor
+    is not 1, because shrinking the scene would otherwise make up for a position error."""
     poses, going = start.clone(), torch.arange(len(start))
     eye = torch.eye(len(space.names), dtype=torch.float64)
     unscaled = space.unscaled

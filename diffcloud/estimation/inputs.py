@@ -10,8 +10,8 @@ drag and the inertia of the air gain s⁵. All terms are then divided by s⁴. L
 compression and friction are ratios, and damping is a time. So the mesh and everything computed from it stay the same.
 
 c is below the centre of the cloth, on the table, so the table does not move. The grasped nodes do move, which the pose
-compensates. The contact thickness becomes s times as large, and soft handles s² times as stiff. These two errors are
-negligible for size changes of a few percent.
+compensates. Three quantities become wrong: the contact thickness (s times too large), the stiffness of soft handles
+(s²), and the curvature at which a bending table is read (s). For size changes of a few percent this is negligible.
 """
 
 from __future__ import annotations

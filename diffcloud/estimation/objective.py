@@ -238,10 +238,8 @@ class Objective:
 
     def way_squares(self, motion: Motion) -> list[float]:
         """Return the capped mean squared distance of each direction for one matched motion, in squared length units.
-
         The first value is from simulated to recorded points. The default loss adds the value from recorded points to
-        the cloth.
-        """
+        the cloth."""
         return [float(pairs.squares(self._moved(motion, pairs), self.cap).mean() / pairs.share) for pairs in motion.pairs]
 
     def points(self, run: Rollout, *, pose: Tensor | None = None) -> Tensor:
@@ -317,11 +315,9 @@ class Objective:
             return replace(matcher(pose), nodes=nodes, velocities=velocities)
 
     def _lowest(self, nodes: Tensor, velocities: Tensor | None) -> tuple[Tensor, Matcher]:
-        """Return the best poses [B, d] and their matcher, starting from the pose of the nominal material.
-
-        With a free scale the loss has several minima in the pose. Then a second search starts at scale 0, and the lower
-        minimum is used.
-        """
+        """Return the best poses [B, d] and their matcher, starting from the pose of the nominal material. With a free
+        scale the loss has several minima in the pose. Then a second search starts at scale 0, and the lower minimum is
+        used."""
         space, first = self.pose_space, self._first_pose().expand(len(nodes), -1)
         pose, matcher = self._follow(nodes, velocities, first, _CAPS)
         if "scale" in space.names:
@@ -449,11 +445,9 @@ class Objective:
         return space.moved(pairs.places.of(motion.shown(space)), motion.pose)
 
     def _drawn(self, generator: torch.Generator) -> Recorded:
-        """Sample the recorded points that are compared with the cloth, about as many as simulated points.
-
-        Each clock has the same number of points in every frame, at least one. Their weights correct for the clock's
-        share of the frame's points.
-        """
+        """Sample the recorded points that are compared with the cloth, about as many as simulated points. Each clock
+        has the same number of points in every frame, at least one. Their weights correct for the clock's share of the
+        frame's points."""
         target = self._target
         every = np.array([[len(of) if of.any() else 0 for of in sure] for sure in target.sure])  # [C, L]
         counts = np.maximum(np.floor(self.point_count * every.sum(1) / every.sum()).astype(int), 1)

@@ -225,11 +225,9 @@ class FitSpace:
         return (self.prior_weights(recordings) * self.off_centre(values).square()).sum(-1).exp()
 
     def off_centre(self, values: Tensor) -> Tensor:
-        """Return the deviations [..., k] of values from the centres of their priors.
-
-        For log-normal priors this is the logarithm of the ratio, for normal priors the number of standard deviations.
-        Variables without a prior give zero.
-        """
+        """Return the deviations [..., k] of values from the centres of their priors. For log-normal priors this is the
+        logarithm of the ratio, for normal priors the number of standard deviations. Variables without a prior give
+        zero."""
         normal = torch.tensor([variable.deviation is not None for variable in self.variables])
         scales = values.new_tensor([v.centre if v.deviation is None else v.deviation for v in self.variables])
         known = torch.tensor([variable.prior is not None for variable in self.variables])

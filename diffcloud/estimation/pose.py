@@ -1,7 +1,7 @@
 """Pose of a recording relative to the scene. It is fitted for each episode, and is no property of the cloth.
 
-The scene is rotated about the recording's centre c by the rotation vector w = (tilt_x, tilt_y, yaw), shifted by t = (x,
-y, z), scaled by e^scale, and evaluated at a time that is later by `lag`:
+The pose rotates the scene about the recording's centre c by the rotation vector w = (tilt_x, tilt_y, yaw). It shifts
+the scene by t = (x, y, z) and scales it by e^scale. Times are later by `lag`:
 
     x' = e^scale exp([w]×) (x(time + lag) - c) + c + t
 
@@ -316,11 +316,9 @@ def _rotation(vectors: Tensor) -> Tensor:
 
 
 def _turnings(vectors: Tensor) -> Tensor:
-    """Return the derivatives [3, B, 3, 3] of the rotation with respect to the components of w.
-
-    Along axis e it is [J e]× times the rotation, with J = I + (1 - cos θ) / θ² [w]× + (θ - sin θ) / θ³ [w]×²
-    (Chirikjian 2012, section 10.8).
-    """
+    """Return the derivatives [3, B, 3, 3] of the rotation with respect to the components of w. Along axis e it is [J
+    e]× times the rotation, with J = I + (1 - cos θ) / θ² [w]× + (θ - sin θ) / θ³ [w]×² (Chirikjian 2012, section
+    10.8)."""
     cross, (_, second, third) = _cross(vectors), _weights(vectors)
     jacobian = torch.eye(3, dtype=vectors.dtype) + second * cross + third * (cross @ cross)
     return _cross(jacobian.movedim(-1, 0)) @ _rotation(vectors)

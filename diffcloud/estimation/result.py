@@ -247,11 +247,9 @@ def recorded_pose(recording: RecordingFit, *, length_unit_m: float) -> tuple[Pos
 
 
 def write_fit(folder: Path, name: str, result: FitResult) -> Path:
-    """Write `<name>.npz` and `<name>.json` together, and return the path of the latter.
-
-    The arrays are nodes, start_nodes, faces, times, obstacle_nodes, obstacle_faces, held, held_times and held_nodes. A
-    second recording has nodes_1 and so on.
-    """
+    """Write `<name>.npz` and `<name>.json` together, and return the path of the latter. The arrays are nodes,
+    start_nodes, faces, times, obstacle_nodes, obstacle_faces, held, held_times and held_nodes. A second recording has
+    nodes_1 and so on."""
     path = Path(folder) / f"{name}.json"
     arrays: dict[str, Any] = {}
     for index, motion in enumerate(result.motions):

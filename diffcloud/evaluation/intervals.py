@@ -292,11 +292,8 @@ def draws(found: Intervals, space: FitSpace, count: int, seed: int) -> list[dict
 
 
 def significant(low: float | None, high: float | None) -> Callable[[float | None], str]:
-    """Return a function that formats a number with as many digits as its interval justifies.
-
-    It uses two digits if the number is known within tens of percent, three within a few percent, and so on. Without an
-    interval it uses three.
-    """
+    """Return a function that formats a number with as many digits as its interval justifies. It uses two digits if the
+    number is known within tens of percent, three within a few percent, and so on. Without an interval it uses three."""
     digits = 3
     if low is not None and high is not None and 0 < low < high:
         digits = 2 + min(max(math.floor(-math.log10((high - low) / (high + low))), 0), 4)

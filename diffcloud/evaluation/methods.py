@@ -103,11 +103,9 @@ def single_start(objective: Objective, space: FitSpace, settings: AdamSettings) 
 
 
 def first_start(fit: FitRecord, space: FitSpace) -> Estimate | None:
-    """Return the result of the paper's setting if it is part of the fit: its first start, from the mid-range.
-
-    Starts are independent, so it need not be run again, but its wall time is unknown. None if another solver was used,
-    the fit was smoothed or resampled, began elsewhere, or was stopped by another start.
-    """
+    """Return the result of the paper's setting if it is part of the fit: its first start, from the mid-range. Starts
+    are independent, so it need not be run again, but its wall time is unknown. None if another solver was used, the fit
+    was smoothed or resampled, began elsewhere, or was stopped by another start."""
     if fit.solver != "adam":
         return None
     settings, history = fit.settings, fit.history

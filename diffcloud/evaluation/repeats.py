@@ -21,10 +21,8 @@ def fit_of(record: Mapping[str, Any]) -> Mapping[str, Any] | None:
 
 def parameter_table(records: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
     """Return one row per episode with its own fit: scenario, episode, fabric, category, repeat, loss and parameters.
-
     `ratio` is stretching over density, if both are there. Nuisance parameters are omitted. Joint fits are omitted,
-    since their recordings share the parameters.
-    """
+    since their recordings share the parameters."""
     rows = []
     for record in records:
         fit = fit_of(record)

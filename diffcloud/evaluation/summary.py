@@ -72,11 +72,8 @@ def method_table(records: Records, references: Mapping[tuple[str, str], float] |
 
 def fit_table(records: Records) -> pd.DataFrame:
     """Return one row per fit: losses at start and end in squared length units and as RMS [mm], fitted and true
-    parameters.
-
-    Losses are means over the episodes of a joint fit. The ratio stretching over density is included, because a motion
-    identifies it best.
-    """
+    parameters. Losses are means over the episodes of a joint fit. The ratio stretching over density is included,
+    because a motion identifies it best."""
     fits: dict[tuple[str, str], list[tuple[Mapping[str, Any], Mapping[str, Any]]]] = {}
     for record in records:
         fit = fit_of(record)
@@ -112,11 +109,9 @@ def _mean_of(rows: Sequence[Mapping[str, Any]], name: str) -> float:
 
 
 def method_means(table: pd.DataFrame) -> pd.DataFrame:
-    """Return one row per scenario and method, over the episodes with a result.
-
-    It has means of distances and simulations, medians of errors, and the success rate. `best` is the number of episodes
-    in which no other method has a significantly lower loss.
-    """
+    """Return one row per scenario and method, over the episodes with a result. It has means of distances and
+    simulations, medians of errors, and the success rate. `best` is the number of episodes in which no other method has
+    a significantly lower loss."""
     measured = table[table["status"] == "ok"]
     lowest = measured.groupby(["scenario", "episode"])["loss"].transform("min")
     best = measured["loss"] <= lowest + _CLEARLY * measured["loss_deviation"]

@@ -21,10 +21,8 @@ Frames = Literal["loss", "all"]
 
 class CloudDataset(Dataset[tuple[Tensor, Tensor]]):
     """Clouds and parameters of the runs of a simulated set. They depend on (seed, epoch, run) only, not on the batch.
-
     An item is (clouds float32 [T', points, 3], parameters float32 [k]). Parameters are scaled so that the bounds are 0
-    and 1. `batch` returns whole batches directly, and a `DataLoader` fetches them too.
-    """
+    and 1. `batch` returns whole batches directly, and a `DataLoader` fetches them too."""
 
     def __init__(
         self,

@@ -33,11 +33,9 @@ def gather_points(values: Tensor, index: Tensor) -> Tensor:
 
 @torch.no_grad()
 def canonical_start(points: Tensor) -> Tensor:
-    """Return the index [B] of the point farthest from the centre of the bounding box of points [B, N, 3].
-
-    Ties are resolved by the largest x, then y, then z. Unlike the mean, the box does not depend on the order of the
-    points, not even in the last bits.
-    """
+    """Return the index [B] of the point farthest from the centre of the bounding box of points [B, N, 3]. Ties are
+    resolved by the largest x, then y, then z. Unlike the mean, the box does not depend on the order of the points, not
+    even in the last bits."""
     middle = 0.5 * (points.amin(1, keepdim=True) + points.amax(1, keepdim=True))
     distance = (points - middle).square().sum(-1, keepdim=True)
     candidate = torch.ones_like(distance[..., 0], dtype=torch.bool)

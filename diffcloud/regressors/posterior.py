@@ -67,11 +67,9 @@ class Posterior(nn.Module):
         return drawn.transpose(0, 1).sigmoid()
 
     def log_density(self, clouds: Tensor, fractions: Tensor) -> Tensor:
-        """Return log-densities [B, S] of fractions [B, S, k], up to a constant for each cloud.
-
-        They are densities of the logits. This ranking differs from that by densities of the parameters, so compare only
-        values of this function, as in a coverage check.
-        """
+        """Return log-densities [B, S] of fractions [B, S, k], up to a constant for each cloud. They are densities of
+        the logits. This ranking differs from that by densities of the parameters, so compare only values of this
+        function, as in a coverage check."""
         found: Tensor = self.flow.log_prob(_logits(fractions).transpose(0, 1), condition=self(clouds))
         return found.transpose(0, 1)
 

@@ -58,12 +58,9 @@ class Scene:
         return SurfaceMesh.joined([obstacle for obstacle in self.surrounding.obstacles if obstacle.plane() is None])
 
     def nominal(self, name: Quantity) -> float:
-        """Return the quantity to which a multiplier refers, in the scene's units.
-
-        These are stretching stiffness at rest [N/m], shear stiffness divided by it, and bending stiffness [N·m]. Others
-        are density [kg/m²], air density [kg/m³], added mass [kg/m²] and linear drag [kg/(m²·s)] of the air, and the
-        mass of all rigid bodies [kg].
-        """
+        """Return the quantity to which a multiplier refers, in the scene's units. These are stretching stiffness at
+        rest [N/m], shear stiffness divided by it, and bending stiffness [N·m]. Others are density [kg/m²], air density
+        [kg/m³], added mass [kg/m²] and linear drag [kg/(m²·s)] of the air, and the mass of all rigid bodies [kg]."""
         match name:
             case "stretching":
                 return self.material.resting_stretching_stiffness
@@ -93,10 +90,8 @@ class Scene:
 
     def finer(self) -> Scene:
         """Return the same scene with each face of the cloth divided into four. The first nodes are those of this scene.
-
         A new node between two nodes that are held in the same way is held like them. So pads and pivots keep their
-        size.
-        """
+        size."""
         mesh, edges = refined(self.mesh)
         turned = {replace(handle, turned=Handle.turned): handle.turned for handle in self.handles.handles}
         more: list[Handle] = []

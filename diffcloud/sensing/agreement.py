@@ -176,11 +176,9 @@ class _Surface:
         return _Surface(own, normal, cKDTree(own) if len(own) else None)
 
     def height(self, points: Floats, facing: Floats) -> tuple[Floats, Floats]:
-        """Return signed distances [N] of points above the surface, and the surface normals [N, 3].
-
-        A distance is NaN if no nearby surface has about the normal `facing` [N, 3]. This separates the two sides of the
-        cloth and the layers of a fold.
-        """
+        """Return signed distances [N] of points above the surface, and the surface normals [N, 3]. A distance is NaN if
+        no nearby surface has about the normal `facing` [N, 3]. This separates the two sides of the cloth and the layers
+        of a fold."""
         height, normal = np.full(len(points), np.nan), np.zeros((len(points), 3))
         if self.tree is None or not len(points):
             return height, normal

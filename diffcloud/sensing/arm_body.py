@@ -45,10 +45,8 @@ _GEN3_CABLE = (
 
 def lookalike(robot: Robot, rng: np.random.Generator, *, largest_growth_m: float = 0.003) -> Robot:
     """Return the robot with every convex part of its links rounded at the edges and grown by up to `largest_growth_m`.
-
     Each part is moved inwards by the rounding radius, then expanded by a ball of radius rounding plus growth. The
-    growth of each part is random.
-    """
+    growth of each part is random."""
     meshes = {
         name: joined([_rounded(part, rng.uniform(0.0, largest_growth_m)) for part in _parts(mesh)])
         for name, mesh in robot.description.meshes.items()

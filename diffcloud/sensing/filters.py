@@ -110,10 +110,8 @@ def thin(
 
 def in_large_clusters(points: NDArray[np.floating[Any]], gap: float, least_part: float) -> NDArray[np.bool_]:
     """Return which points belong to a cluster with at least `least_part` of the largest cluster's points, bool [N].
-
     Points in adjacent voxels of side `gap`, also diagonally, belong to one cluster, so clusters are at least `gap`
-    apart. Points have three coordinates, or time as a fourth one.
-    """
+    apart. Points have three coordinates, or time as a fourth one."""
     if not len(points):
         return np.zeros(0, dtype=bool)
     cell = np.floor(points / gap).astype(np.int64)

@@ -31,10 +31,7 @@ _LONGEST_STEP_RAD = 0.3
 
 def gen3() -> Robot:
     """Return the package's own Kinova Gen3 (7 joints) with a Robotiq 2F-85: published joint constants, cylinders and
-    boxes.
-
-    The links cover the manufacturers' surfaces to within 5 mm (measured at the vertices of their meshes).
-    """
+    boxes. The links cover the manufacturers' surfaces to within 5 mm (measured at the vertices of their meshes)."""
     with as_file(files("diffcloud.sensing") / "gen3_robotiq_2f_85.urdf") as path:
         return Robot.from_urdf(path)
 
@@ -106,11 +103,8 @@ class Robot:
     @cached_property
     def fingers(self) -> tuple[Floats, Floats]:
         """[A] configurations with open and with closed gripper, at the limits of the finger joints; zero for joints
-        without limits.
-
-        The model does not state which limit is open. A Robotiq 2F-85 is open at the lower limit, a Franka Hand at the
-        upper. So the limit at which the fingers' surfaces are farther apart is taken as open.
-        """
+        without limits. The model does not state which limit is open. A Robotiq 2F-85 is open at the lower limit, a
+        Franka Hand at the upper. So the limit at which the fingers' surfaces are farther apart is taken as open."""
         low, high = (np.array([getattr(joint, end) for joint in self.moving]) for end in ("lower", "upper"))
         bounded = np.isfinite(low) & np.isfinite(high)
         low, high = np.where(bounded, low, 0.0), np.where(bounded, high, 0.0)

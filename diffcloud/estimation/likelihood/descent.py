@@ -33,8 +33,8 @@ _REFRESH = 1.0
 _NARROW = 0.05
 """Smallest bound on a step after divergence or an increase of Φ."""
 _GAINS, _BEHIND = 3.0, 20.0
-"""A start is abandoned if its Φ, minus the first number times the gain that its next step predicts, is still above the
-best Φ by more than the second number."""
+"""A start is abandoned if its expected Φ is above the best one by more than the second number. The expected Φ is its
+current value minus the first number times the gain that the next step predicts."""
 
 
 @dataclass(frozen=True)

@@ -14,11 +14,9 @@ from diffcloud.scene.scenarios import Scenario
 
 
 def regripped(scenario: Scenario) -> list[Scenario]:
-    """Return variants of a scenario with a grasp one standard deviation smaller and, if possible, one larger.
-
-    The larger grasp is omitted unless its pad fits on the cloth and holds the same nodes. The list is empty if the
-    grasp size is known, or if the smaller pad does not fit on the mesh.
-    """
+    """Return variants of a scenario with a grasp one standard deviation smaller and, if possible, one larger. The
+    larger grasp is omitted unless its pad fits on the cloth and holds the same nodes. The list is empty if the grasp
+    size is known, or if the smaller pad does not fit on the mesh."""
     if scenario.regrip is None:
         return []
     found = list[Scenario]()

@@ -46,7 +46,7 @@ def fit_cma_es(
 
 
 class _Generations:
-    """Candidates from the package `cma`, with an own random generator instead of numpy's global one."""
+    """Candidates from the package `cma`, with their own random generator instead of numpy's global one."""
 
     def __init__(self, first: NDArray[np.float64], seed: int) -> None:
         from cma import CMAEvolutionStrategy  # takes a second to import

@@ -21,11 +21,9 @@ _CLEARANCE = 0.015
 
 
 class VestScenario(ScenarioOptions):
-    """A shaped vest, held level at one shoulder, over a level hook that reaches through an arm hole.
-
-    The front faces down, and the shoulders point to -y. The gripper holds the shoulder at +x. The hook comes from +x
-    inside the vest, and ends below the neck end of that shoulder. A YAML file may set every field.
-    """
+    """A shaped vest, held level at one shoulder, over a level hook that reaches through an arm hole. The front faces
+    down, and the shoulders point to -y. The gripper holds the shoulder at +x. The hook comes from +x inside the vest,
+    and ends below the neck end of that shoulder. A YAML file may set every field."""
 
     material: str | Sheet = "foam"
     shaped: bool = True

@@ -111,11 +111,9 @@ def fit_chain(
 
 @dataclass(frozen=True)
 class _Standing:
-    """Current estimate of all poses, and the errors after a step from it.
-
-    A step has 6 entries for each camera and 6 for the board (translation, rotation vector). If sizes are fitted, it
-    also has logarithms of the factors of the board's size and of each camera's focal length.
-    """
+    """Current estimate of all poses, and the errors after a step from it. A step has 6 entries for each camera and 6
+    for the board (translation, rotation vector). If sizes are fitted, it also has logarithms of the factors of the
+    board's size and of each camera's focal length."""
 
     cameras: Mapping[str, CameraViews]
     T_world_gripper: Floats

@@ -35,8 +35,8 @@ Note = tuple[Literal["warning", "objection"], str]
 FEWEST_POSES = 5
 """Minimum number of poses for a solution."""
 HELD_OUT_POSES = 10
-"""Minimum number of poses for a reliable held-out error. In simulations with arm errors of 1 mm and 0.2 degrees per
-pose, nine in ten cameras calibrated at five poses were wrong by 6 to 28 mm, with held-out errors of 2 to 5 mm."""
+"""Minimum number of poses for a reliable held-out error. Five poses were simulated with arm errors of 1 mm and 0.2
+degrees. Nine in ten cameras were then wrong by 6 to 28 mm, although the held-out errors were only 2 to 5 mm."""
 ADVISED_POSES = 15
 LARGEST_ERROR_MM = 10.0
 """Maximum held-out error."""

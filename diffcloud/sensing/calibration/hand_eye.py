@@ -188,11 +188,9 @@ def _fitted(cameras: Mapping[str, CameraViews], T_world_gripper: Floats, groups:
 def _held_out(
     cameras: Mapping[str, CameraViews], T_world_gripper: Floats, groups: Integers, corners: Floats
 ) -> dict[str, tuple[Floats, Floats, int]]:
-    """Return errors [N] in pixels and millimetres at held-out poses, and the number of these poses, for each camera.
-
-    A pose is held out for all cameras at once, together with repeated visits. Folds are balanced, so that each camera
-    loses about the same number of poses. If there are few poses, each is left out separately.
-    """
+    """Return errors [N] in pixels and millimetres at held-out poses, and the number of these poses, for each camera. A
+    pose is held out for all cameras at once, together with repeated visits. Folds are balanced, so that each camera
+    loses about the same number of poses. If there are few poses, each is left out separately."""
     seen = {name: {int(groups[view.pose]) for view in camera.views} for name, camera in cameras.items()}
     order = sorted(set().union(*seen.values()), key=lambda group: ([group in held for held in seen.values()], group))
     count = _FOLDS if len(order) >= HELD_OUT_POSES else len(order)
@@ -218,11 +216,9 @@ def _held_out(
 
 
 def _hand_eye(camera: CameraViews, T_world_gripper: Floats, corners: Floats) -> Floats:
-    """Return T_world_camera [4, 4] of one camera by the method of Park and Martin.
-
-    OpenCV solves for a camera on the gripper. Here the camera is fixed and the board moves. So the inverted gripper
-    poses are passed, and the result is the camera in the base frame.
-    """
+    """Return T_world_camera [4, 4] of one camera by the method of Park and Martin. OpenCV solves for a camera on the
+    gripper. Here the camera is fixed and the board moves. So the inverted gripper poses are passed, and the result is
+    the camera in the base frame."""
     import cv2
 
     if len(camera.views) < 3:

@@ -101,11 +101,9 @@ def _pose(camera: RecordedCamera, folder: Path, calibration: Path | None) -> NDA
 
 
 def exchanged_cameras(cameras: list[RecordedCamera], folder: Path, calibration: Path | None) -> Iterator[Finding]:
-    """Yield findings about exchanged cameras.
-
-    Poses count as exchanged if two views of one scene agree, or the table is level, only with each other's pose.
-    Folders count as exchanged if one holds the camera that another is named after.
-    """
+    """Yield findings about exchanged cameras. Poses count as exchanged if two views of one scene agree, or the table is
+    level, only with each other's pose. Folders count as exchanged if one holds the camera that another is named
+    after."""
     names = {camera.name for camera in cameras}
     for camera in cameras:
         if camera.info is not None and camera.info.name != camera.name and camera.info.name in names:
