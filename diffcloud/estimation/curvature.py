@@ -41,8 +41,7 @@ class Placements(NamedTuple):
 
 
 class Partners(NamedTuple):
-    """N pairs of a surface point and a recorded point per frame. Axis B or L has length one if all motions or frames
-    share the values."""
+    """N pairs of a surface point and a recorded point per frame. Shared values have length one along axis B or L."""
 
     corners: Ints
     """[B, L, N, 3] nodes of the face that contains the surface point, all of one clock."""
@@ -166,8 +165,7 @@ def _inside(values: Floats, i: int, j: int, k: int, u: float, v: float, w: float
 
 @kernel
 def _across(nodes: Floats, velocities: Floats, lag: float, i: int, j: int, k: int) -> tuple[float, float, float]:
-    """Return the normal of a face after a lag, with the length of twice its area. Without velocities, the lag is
-    zero."""
+    """Return the normal of a face after a lag, with twice the face's area as its length."""
     a0, a1, a2 = nodes[j, 0] - nodes[i, 0], nodes[j, 1] - nodes[i, 1], nodes[j, 2] - nodes[i, 2]
     b0, b1, b2 = nodes[k, 0] - nodes[i, 0], nodes[k, 1] - nodes[i, 1], nodes[k, 2] - nodes[i, 2]
     if lag != 0.0:

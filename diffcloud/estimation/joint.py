@@ -72,8 +72,7 @@ AnyObjective = Objective | JointObjective
 
 
 def mean_loss(losses: Tensor, *, paper: bool) -> Tensor:
-    """Average the losses [n, B] of n recordings to [B]: geometric mean, or arithmetic mean for the loss of the
-    paper."""
+    """Average losses [n, B] over n recordings: geometric mean, or arithmetic mean for the loss of the paper."""
     return losses.mean(0) if paper or len(losses) == 1 else losses.clamp(min=_TINY).log().mean(0).exp()
 
 

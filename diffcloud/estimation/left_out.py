@@ -18,8 +18,7 @@ from diffcloud.estimation.solvers import LikelihoodSettings, Progress, solve
 from diffcloud.sim.properties import one_set
 
 Tell = Callable[[float, str, Progress], None]
-"""Progress callback. Its arguments are the fraction of recordings already done, a label, and the progress of the
-current fit."""
+"""Progress callback of (fraction of recordings done, label, progress of the current fit)."""
 
 
 def leave_each_out(

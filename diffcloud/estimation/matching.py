@@ -45,8 +45,7 @@ class Pairs:
     partners: Tensor
     """[B, L, N, 3] recorded points, in the recording's frame."""
     normals: Tensor | None
-    """[B, L, N, 3] normals of the surface along which a pair may slide, in the recording's frame. None: the face
-    normals."""
+    """[B, L, N, 3] normals of the recorded surface, along which a pair may slide. None: the face normals."""
     spacing: Tensor
     """[L] distance between neighbouring recorded points."""
     weights: Tensor

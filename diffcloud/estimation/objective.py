@@ -128,8 +128,7 @@ class Objective:
 
     @property
     def cut(self) -> float | None:
-        """Height below which the recording was cropped, in scene units, or None. Simulated points below it are
-        omitted."""
+        """Crop height of the recording in scene units, or None. Simulated points below it are omitted."""
         return self._target.cut
 
     @property
@@ -143,8 +142,7 @@ class Objective:
 
     @property
     def track(self) -> Tensor | None:
-        """[1, S, G, 3] gripper displacements up to the last compared frame, in scene units. None: the scene's own
-        motion."""
+        """[1, S, G, 3] gripper displacements up to the last compared frame. None: the scene's own motion."""
         track = self._target.track
         return None if track is None else track[:, : self.loss_steps]
 

@@ -44,8 +44,7 @@ class Variable:
     centre: float = 1.0
     """Centre of the prior; by default the nominal material."""
     role: Role = "requested"
-    """`material` and `initial_state` are nuisance variables: they are fitted because they are uncertain, but not
-    reported."""
+    """`material` and `initial_state` are nuisance variables: fitted because they are uncertain, but not reported."""
     deviation: float | None = None
     """Standard deviation of a normal prior about zero, for variables that may be negative. None: no such prior."""
 

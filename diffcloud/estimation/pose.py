@@ -47,8 +47,7 @@ NUISANCE: dict[str, Literal["m", "rad", "s", "1"]] = {
 }
 """Pose variable -> unit."""
 SET_UP = {"x": 0.002, "y": 0.002, "z": 0.002, "tilt_x": 0.005, "tilt_y": 0.005, "yaw": 0.005, "lag": 0.002}
-"""Standard deviations for a calibrated set-up [m, rad, s]: extrinsics of the cameras relative to the robot, and the
-clock."""
+"""Standard deviations for a calibrated set-up [m, rad, s]: camera extrinsics relative to the robot, and clock."""
 BY_HAND = {"x": 0.1, "y": 0.1, "yaw": math.radians(30)}
 """Standard deviations for a cloth that is placed by hand at its position in the scene [m, rad]."""
 _RESOLVED = {"m": 3e-4, "rad": 1.5e-3, "s": 3e-4, "1": 1.5e-3}
@@ -309,8 +308,8 @@ class PoseSpace:
 
 
 def _rotation(vectors: Tensor) -> Tensor:
-    """Return rotation matrices [B, 3, 3] of rotation vectors w [B, 3]: I + sin θ / θ [w]× + (1 - cos θ) / θ² [w]×², θ =
-    |w|."""
+    """Return rotation matrices [B, 3, 3] of rotation vectors w [B, 3] with θ = |w|: I + sin θ / θ [w]× + (1 - cos θ) /
+    θ² [w]×² (Rodrigues' formula)."""
     cross, (first, second, _) = _cross(vectors), _weights(vectors)
     return torch.eye(3, dtype=vectors.dtype) + first * cross + second * (cross @ cross)
 

@@ -37,8 +37,7 @@ class NuisanceValue(_Model):
 
     value: Pose
     prior: Annotated[float, Field(gt=0, le=1e3)]
-    """Standard deviation of the prior. It is centred on the clock offset (`RecordingFit.clocks`) for a lag, else on
-    zero."""
+    """Standard deviation of the prior, which is centred on the stated clock offset for a lag, and else on zero."""
     unit: Literal["m", "rad", "s", "1"]
     """Unit of value and prior."""
     of: Literal["pose", "cloth"] = "pose"
@@ -81,8 +80,7 @@ class RecordingFit(_Model):
     centre: tuple[Pose, Pose, Pose]
     """[3] centre of the recording, about which the scene is rotated [length unit]."""
     clocks: dict[str, Pose] = Field(default_factory=lambda: {"lag": 0.0}, min_length=1)
-    """Lag variable of each clock -> offset [s] that the recording states. The variable is in `nuisance` if it is
-    free."""
+    """Lag variable of each clock -> offset [s] that the recording states. Free ones are also in `nuisance`."""
     left_out: LeftOut | None = None
     """Leave-one-out result, in a joint fit."""
 

@@ -126,8 +126,7 @@ def _by_differences(objective: Objective, space: FitSpace, places: Tensor) -> Mo
 
 
 def _sides(axis: Axis, places: Tensor) -> Tensor:
-    """Return coordinates [2, k, B, k] above and below each parameter set [B, k] along each variable, clipped to the
-    bounds."""
+    """Return coordinates [2, k, B, k] one step above and below [B, k] along each variable, clipped to the bounds."""
     low, high = axis.ends
     steps = STEP * _ways(places)
     return torch.stack([torch.minimum(torch.maximum(places + sign * steps, low), high) for sign in (1, -1)])

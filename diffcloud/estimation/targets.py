@@ -224,8 +224,7 @@ def _lost(episode: Episode, frames: Sequence[int]) -> tuple[LostPixels, ...]:
 
 
 def _planes(episode: Episode) -> Tensor | None:
-    """Return the crop planes of the cameras with known positions. A plane of zeros, which removes nothing, stands for
-    no crop."""
+    """Return the crop planes of the cameras with known positions. A plane of zeros stands for no crop."""
     planes = episode.cut_planes
     found = [planes.get(name, np.zeros(4)) for name in episode.viewpoints]
     return torch.from_numpy(np.stack(found)) if planes and found else None

@@ -147,8 +147,7 @@ def compare_episode(
 
 
 def _run(baseline: Baseline, objective: Objective, space: FitSpace, fit: FitRecord, seed: int) -> Estimate | Gap:
-    """Run one baseline with the simulation budget of the fit, or of one start of Adam. Return a gap if its simulations
-    fail."""
+    """Run one baseline with the budget of the fit, or of one start of Adam. Return a gap if its simulations fail."""
     told, by_adam = fit.settings, fit.solver == "adam"
     simulations = int(told["max_steps"] or 0) + 1 if by_adam else methods.simulations_each(fit)
     threshold = float(told.get("threshold") or 0.0)

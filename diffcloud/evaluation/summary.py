@@ -35,8 +35,7 @@ PREDICTORS = (
 _CLEARLY = 2.0
 """Difference of two losses that counts as significant, in standard deviations."""
 _FAR = 1.25
-"""If repeats or motions differ by more than this multiple of the interval, the value is not a property of the
-fabric."""
+"""A value is no property of the fabric if repeats or motions differ by this multiple of its interval."""
 Records = Sequence[Mapping[str, Any]]
 Tables = Mapping[str, pd.DataFrame]
 """Type of the result of `tables`."""

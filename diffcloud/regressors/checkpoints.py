@@ -136,8 +136,7 @@ class OutputScale:
     target: Target
 
     def values(self, fractions: Tensor) -> Tensor:
-        """Convert fractions [..., k] of the range on the target's scale to parameters in their own units, without
-        clipping."""
+        """Convert fractions [..., k] of the range on the target's scale to parameters, without clipping."""
         low, high = self.bounds.unbind(-1)
         if self.target == "logarithmic":
             return low * (high / low) ** fractions
@@ -184,8 +183,7 @@ class Prediction:
         return self.values.clamp(low, high)
 
     def interval(self, level: float) -> tuple[Tensor, Tensor]:
-        """Return lower and upper ends [B, k] of intervals with this probability, if widths or posterior are
-        calibrated."""
+        """Return lower and upper ends [B, k] of intervals with this probability, from the widths or the posterior."""
         if self.samples is not None:
             low, high = torch.quantile(self.samples, torch.tensor([0.5 - level / 2, 0.5 + level / 2]), dim=1)
             return low, high

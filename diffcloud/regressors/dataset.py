@@ -67,8 +67,7 @@ class CloudDataset(Dataset[tuple[Tensor, Tensor]]):
         return len(self.simulated)
 
     def set_epoch(self, epoch: int) -> None:
-        """Use new random numbers for every run. A persistent worker of a `DataLoader` has its own copy, which does not
-        change."""
+        """Use new random numbers for every run. Persistent workers of a `DataLoader` keep their own copy."""
         self.epoch = epoch
 
     def batch(self, runs: Sequence[int] | Tensor) -> tuple[Tensor, Tensor]:

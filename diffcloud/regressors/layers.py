@@ -57,8 +57,7 @@ class _Highest(torch.autograd.Function):
 
 
 def highest(values: Tensor) -> Tensor:
-    """Return the maximum over N points, [..., N, C] -> [..., C]. The gradient goes to the first point among equal
-    ones."""
+    """Return the maximum over N points, [..., N, C] -> [..., C]. The first maximum gets the gradient."""
     found: Tensor = _Highest.apply(values)
     return found
 

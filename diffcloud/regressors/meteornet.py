@@ -37,8 +37,7 @@ class MeteorModule(nn.Module):
         self.network = LocalNetwork(4, features, widths)
 
     def forward(self, points: Tensor, times: Tensor, features: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
-        """Map points [B, N, 3], times [B, N] and features [B, N, C] or None to those of the centroids, with widths[-1]
-        features."""
+        """Map points [B, N, 3], times [B, N] and features [B, N, C] or None to those of the centroids."""
         chosen = farthest_points(points, min(self.centroids, points.shape[1]))
         placed = torch.cat([points, times[..., None]], dim=-1)
         centroids = gather_points(placed, chosen)
@@ -88,8 +87,8 @@ class MeteorNet(nn.Module):
         self.head = Head(GLOBAL_WIDTHS[-1], outputs, dropout=(dropout, dropout))
 
     def forward(self, clouds: Tensor) -> Tensor:
-        """Map clouds [B, T, P, 3] to [B, outputs]. A sequence may be shorter or longer than in training, at the same
-        frame rate."""
+        """Map clouds [B, T, P, 3] to [B, outputs]. The number of frames may differ from training, but not the frame
+        rate."""
         batch, frames, count, _ = clouds.shape
         # frames alternate, so that the first points in a ball come from all of them
         points = clouds.transpose(1, 2).flatten(1, 2)

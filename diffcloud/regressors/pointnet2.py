@@ -52,8 +52,7 @@ class SetAbstraction(nn.Module):
         self.networks = nn.ModuleList(LocalNetwork(3, features, widths) for widths in scales.widths)
 
     def forward(self, points: Tensor, features: Tensor | None) -> tuple[Tensor, Tensor]:
-        """Map points [B, N, 3] and features [B, N, C] or None to centroids [B, M, 3] and features [B, M, sum of
-        widths]."""
+        """Map points [B, N, 3] and features [B, N, C] or None to centroids [B, M, 3] and features [B, M, C']."""
         centroids = gather_points(points, farthest_points(points, min(self.centroids, points.shape[1])))
         groups = ball_groups(points, centroids, self.radii, self.neighbours, order=self.order)
         found = [

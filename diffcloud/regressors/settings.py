@@ -18,8 +18,7 @@ errors and keep predictions positive."""
 Profile = Literal["quick", "reduced", "paper"]
 PROFILE_NAMES: tuple[Profile, ...] = get_args(Profile)
 BACKGROUND_REACH_M = 0.01
-"""Points closer to the obstacle than this belong to it [m]. It is larger than a depth camera's noise and smaller than a
-fold."""
+"""Distance within which points belong to the obstacle [m]: more than a depth camera's noise, less than a fold."""
 
 
 @dataclass(frozen=True)

@@ -257,8 +257,7 @@ class _Batches(Dataset[tuple[Tensor, Tensor]]):
 
 
 class _Order(Sampler[tuple[int, list[int]]]):
-    """Batches of one epoch. A shuffled epoch drops its incomplete last batch, which would disturb batch
-    normalisation."""
+    """Batches of one epoch. A shuffled epoch drops an incomplete last batch, because of batch normalisation."""
 
     def __init__(self, indices: Sequence[int], batch_size: int, *, shuffle_seed: int | None) -> None:
         self.indices, self.batch_size, self.seed = list(indices), min(batch_size, len(indices)), shuffle_seed
@@ -473,8 +472,7 @@ def _fit(
 
 
 def _readable_state(path: Path) -> int:
-    """Return the number of completed epochs in a saved state; 0 if it is missing or damaged. A damaged file is
-    deleted."""
+    """Return the number of completed epochs in a saved state, or 0. A damaged file is deleted."""
     try:
         saved = torch.load(path, map_location="cpu", weights_only=True)
         return int(saved["epoch"]) + 1
@@ -524,8 +522,7 @@ class _Measured:
     inside: Tensor
     """bool [n, L, k], whether intervals of the L levels in `LEVELS` contain the true value."""
     ranks: Tensor | None
-    """[n, k + 1] for a posterior: fractions of its samples below the true values, and the fraction with a higher
-    density."""
+    """[n, k + 1] for a posterior: fractions of samples below the true values, and of samples with higher density."""
 
 
 def _measured(regressor: Regressor, dataset: CloudDataset, indices: Sequence[int]) -> _Measured:

@@ -93,8 +93,8 @@ class Agreement:
     """[8, 8] covariance of the values. Directions that are not identifiable keep that of the prior."""
     before_m: float
     after_m: float
-    """RMS distances from points to the other camera's surface, without and with the correction [m]; NaN if no point is
-    near."""
+    """RMS distances from points to the other camera's surface, before and after the correction [m]; NaN without
+    points."""
 
     @property
     def sigmas(self) -> Floats:
@@ -106,15 +106,13 @@ class Agreement:
         return self._matrix(points - self.eye) + self._shift()
 
     def pinhole(self, seen: Pinhole) -> Pinhole:
-        """Return the second camera's model with corrected pose. The depth scale does not move pixels, so it is
-        ignored."""
+        """Return the second camera's model with corrected pose. The depth scale does not affect pixels."""
         T = seen.T_camera_scene
         R = T[:, :3] @ self._rotation().T
         return replace(seen, T_camera_scene=np.column_stack([R, -R @ self.moved(seen.position[None])[0]]))
 
     def plane(self, plane: Sequence[float]) -> list[float]:
-        """Apply the correction to a half space a x + b y + c z >= d of the second camera's points, given as [a, b, c,
-        d]."""
+        """Apply the correction to a half space a x + b y + c z >= d of the second camera's points."""
         normal, offset = np.array(plane[:3]), plane[3]
         on = self.moved((offset * normal / (normal @ normal))[None])[0]
         turned = self._rotation() @ normal
@@ -288,7 +286,7 @@ def _against(
 
 
 def _between(times: Floats, time: float) -> list[tuple[int, float, float]] | None:
-    """Return three frames with their interpolation weights at a time and the derivatives [1/s]; None outside the
+    """Return three frames with interpolation weights at a time and their derivatives [1/s]; None outside the
     recording."""
     middle = int(np.abs(times - time).argmin())
     if not 0 < middle < len(times) - 1:

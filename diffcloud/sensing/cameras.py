@@ -21,8 +21,7 @@ _ITERATIONS = 30
 
 
 _WIDEST_RAD, _LEAST_SLOPE = np.deg2rad(89.9), 1e-3
-"""Limits for fisheye cameras: rays stay in front of the camera, and Newton steps stay finite where the polynomial is
-flat."""
+"""Fisheye limits: rays stay in front of the camera, and Newton steps are finite for a flat polynomial."""
 
 
 def project(points: Floats, intrinsics: Intrinsics) -> Floats:
@@ -52,8 +51,7 @@ def rays(pixels: Floats, intrinsics: Intrinsics) -> Floats:
 def depth_points(
     depth: NDArray[np.uint16], intrinsics: Intrinsics, depth_scale_m: float, *, step: int = 1
 ) -> tuple[Floats, NDArray[np.int64]]:
-    """Return camera points [P, 3] [m] and pixels [P, 2] of every `step`-th valid measurement of a depth image [H,
-    W]."""
+    """Return camera points [P, 3] [m] and pixels [P, 2] of every `step`-th valid pixel of a depth image [H, W]."""
     row, column = np.nonzero(depth[::step, ::step])
     pixels = np.column_stack([column, row]) * step
     z = depth[pixels[:, 1], pixels[:, 0]] * depth_scale_m
@@ -130,8 +128,7 @@ def _terms(xy: Floats, coefficients: tuple[float, ...]) -> tuple[Floats, Floats]
 
 
 def _tilt(coefficients: tuple[float, ...]) -> Floats:
-    """Return the homography [3, 3] from an upright sensor to one tilted about x, then y (OpenCV's tau_x, tau_y
-    [rad])."""
+    """Return the homography [3, 3] to a sensor tilted about x, then y (OpenCV's tau_x, tau_y [rad])."""
     x, y = coefficients[12:14] or (0.0, 0.0)
     turn = Rotation.from_euler("xy", [-x, -y]).as_matrix()
     onto = np.array([[turn[2, 2], 0, -turn[0, 2]], [0, turn[2, 2], -turn[1, 2]], [0, 0, 1]])

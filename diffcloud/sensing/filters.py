@@ -16,8 +16,7 @@ from diffcloud.io.clouds import import_open3d
 from diffcloud.io.episodes import Episode
 
 Downsampling = Literal["random", "voxel", "farthest"]
-"""`random`: random points. `voxel`: the point nearest the centre of each occupied voxel. `farthest`: farthest-point
-sampling."""
+"""`random`: random points. `voxel`: the most central point of each voxel. `farthest`: farthest-point sampling."""
 
 _BISECTIONS = 20
 

@@ -90,8 +90,7 @@ class FusionSettings:
 
     @property
     def sigma_per_m(self) -> float:
-        """Standard deviation of inverse depth [1/m]. It is the same at all distances: σ_z = z² σ_px / (f ·
-        baseline)."""
+        """Standard deviation of inverse depth [1/m], the same at all distances: σ_z = z² σ_px / (f · baseline)."""
         return self.subpixel_px / (self.imager_focal_px * self.baseline_m)
 
 
@@ -238,8 +237,7 @@ class _Cameras:
                 self._tables[name] = fit_table(self._samples[name])
 
     def cloth(self, frame: int) -> dict[str, Seen]:
-        """Return the cloth points in each camera's image of a frame. Cameras without an image near this time are
-        omitted."""
+        """Return the cloth points in each camera's image of a frame. Cameras without a near image are omitted."""
         parts = {
             name: _without_table(self._cloud(name, index), self._tables[name], self._settings)
             for name, index in self._images(frame).items()

@@ -109,8 +109,7 @@ class RobotMask:
         return self.first_hits(view, poses)[0]
 
     def first_hits(self, view: View, poses: Floats) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
-        """Return the z-depth [H, W] [m] of the inflated robot and the index of the link [H, W]; infinite and -1 beside
-        it."""
+        """Return z-depth [H, W] [m] of the inflated robot and index of the link [H, W]; infinite and -1 beside it."""
         depth = np.full(view.directions.shape[:2], np.inf, dtype=np.float32)
         link = np.full(depth.shape, -1)
         for index, scene, T_link_camera, low, high in self._placed(view.T_world_camera, poses, np.zeros(3)):
@@ -144,8 +143,7 @@ class RobotMask:
     def _placed(
         self, T_world_camera: Floats, poses: Floats, eye: Floats
     ) -> Iterator[tuple[int, Any, Floats, Floats, Floats]]:
-        """Yield (link, scene, T_link_camera, lowest and highest (x, y) of rays from the eye that can hit it) of each
-        link."""
+        """Yield (link, scene, T_link_camera, lowest and highest (x, y) of rays that can hit it) for each link."""
         T_link_camera = inverse(poses[self._indices]) @ T_world_camera
         seen = transform(inverse(T_link_camera), self._corners) - eye
         behind = seen[..., 2] < _NEAREST_M
@@ -235,8 +233,7 @@ def inflate(mesh: LinkMesh, margin_m: float) -> LinkMesh:
 
 
 def offset(mesh: LinkMesh, margin_m: float) -> LinkMesh:
-    """Return the surface with every face moved outwards by `margin_m` (inwards if negative), with equal vertices
-    merged."""
+    """Return the surface moved outwards by `margin_m` (inwards if negative), with equal vertices merged."""
     corner, same = np.unique(np.round(mesh.vertices, 7), axis=0, return_inverse=True)  # STL repeats its vertices
     faces = same.reshape(-1)[mesh.faces]
     normal = np.cross(corner[faces[:, 1]] - corner[faces[:, 0]], corner[faces[:, 2]] - corner[faces[:, 0]])
@@ -283,8 +280,8 @@ def joints_at(log: RobotLog, times: Floats, *, clock_offset_s: float = 0.0) -> t
 
 
 def _cast(scene: Any, T_link_camera: Floats, eye: Floats, directions: Floats) -> NDArray[np.float32]:
-    """Return the distance [...] to the first hit in lengths of `directions` [..., 3]. Rays start at `eye` in the
-    camera's frame."""
+    """Return the distance [...] to the first hit in lengths of `directions` [..., 3], from `eye` in the camera's
+    frame."""
     bundle = np.empty((*directions.shape[:-1], 6), dtype=np.float32)
     bundle[..., :3] = T_link_camera[:3, :3] @ eye + T_link_camera[:3, 3]
     bundle[..., 3:] = rotate(T_link_camera, directions)

@@ -338,8 +338,7 @@ def _table(motion: ClothMotion, settings: RecorderSettings) -> SurfaceMesh:
 
 
 def _motion(millimetres: float, degrees: float, nodes: Floats, rng: np.random.Generator) -> Floats:
-    """Return a transform [4, 4] that rotates about the scene's centre and shifts, by these amounts in random
-    directions."""
+    """Return a random transform [4, 4] with a rotation about the scene's centre and a shift of these sizes."""
     turn_axis, direction = rng.normal(size=(2, 3))
     middle, found = nodes.reshape(-1, 3).mean(axis=0), np.eye(4)
     turn = Rotation.from_rotvec(np.deg2rad(degrees) * turn_axis / np.linalg.norm(turn_axis)).as_matrix()

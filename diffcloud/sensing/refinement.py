@@ -54,8 +54,7 @@ _CONVERGED = 2e-5
 _COLUMNS = 212
 """Images are subsampled to about this many columns, which resolve the surfaces well enough."""
 _GATE_M = 0.03
-"""Measurements farther from the model surface are excluded [m]. This is three times the error of a usable
-calibration."""
+"""Measurements farther from the model surface are excluded [m]; three times the error of a usable calibration."""
 _CLOTH_GATE_M = 0.02
 _SHAPE_M = 0.002
 """Standard deviation of surface errors beyond the skin, and of depth errors beyond noise [m]."""
@@ -378,8 +377,7 @@ def _tukey(u: Floats) -> Floats:
 
 
 def _image_normals(points: Floats, solid: NDArray[np.bool_], directions: Floats) -> tuple[Floats, Floats]:
-    """Return normals [H, W, 3] of an image of points, towards the camera, and cosines [H, W] to the rays; 0 at
-    borders."""
+    """Return normals [H, W, 3] of an image of points, and cosines [H, W] to the rays; 0 at borders."""
     across = np.zeros_like(points)
     down = np.zeros_like(points)
     across[:, 1:-1] = points[:, 2:] - points[:, :-2]
@@ -394,8 +392,7 @@ def _image_normals(points: Floats, solid: NDArray[np.bool_], directions: Floats)
 
 
 def _with_normals(points: Floats) -> tuple[Floats, Floats]:
-    """Return points [P, 3] and the normals [P, 3] of planes through their neighbours; both are empty for too few
-    points."""
+    """Return points [P, 3] and normals [P, 3] of planes through their neighbours; empty for too few points."""
     if len(points) <= _NEIGHBOURS:
         return np.zeros((0, 3)), np.zeros((0, 3))
     _, nearest = cKDTree(points).query(points, k=_NEIGHBOURS)

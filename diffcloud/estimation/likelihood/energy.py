@@ -19,8 +19,7 @@ from diffcloud.estimation.residuals import Axis
 from diffcloud.sim.threads import map_threads
 
 _PART_M, _GONE_M = 0.004, 0.010
-"""RMS displacement by mesh refinement [m] that defines the horizon: the first value after `_LEAST_S`, the second
-before."""
+"""RMS displacement by mesh refinement [m] at the horizon, after `_LEAST_S` and before."""
 _LEAST_S = 1.2
 """Time [s] up to which the horizon is less strict, because a poor initial material may diverge too early."""
 _FAR = 100.0
@@ -79,8 +78,7 @@ class Likelihood:
         return torch.where(self.precision > 0, place - self.centre, 0.0)
 
     def horizons(self, place: Tensor) -> tuple[int, ...]:
-        """Return for each recording the number of frames before the refined and the given mesh diverge from each
-        other."""
+        """Return for each recording the number of frames before the refined and the given mesh diverge."""
 
         def one(recording: Recording) -> int:
             change = recording.change(place, recording.nodes(place), recording.finer)

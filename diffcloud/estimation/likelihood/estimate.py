@@ -24,8 +24,7 @@ from diffcloud.estimation.residuals import Axis
 _START = math.log(4.5)
 """Distance between starts, in the logarithm of the first variable (usually stretching)."""
 _REGRIP = 0.3
-"""If the first start changes the grasp size by more than this, in standard deviations, the fit continues with the new
-size."""
+"""The fit continues with a new grasp size if the first start changes it by more standard deviations than this."""
 
 
 @dataclass(frozen=True)
@@ -60,8 +59,7 @@ class Estimate:
 
     @property
     def sources(self) -> dict[str, Tensor]:
-        """Source of uncertainty -> contribution to the mixture's covariance [K, K]. `starts` is the spread between
-        results."""
+        """Source of uncertainty -> contribution to the covariance [K, K]. `starts` is the spread between results."""
         apart, mean = torch.zeros_like(self.best.covariance), self.mean
         found = {name: torch.zeros_like(apart) for name in self.best.sources}
         for weight, one in zip(self.weights.tolist(), self.answers, strict=True):

@@ -61,8 +61,7 @@ class GridScenario(ScenarioOptions):
     grip_m: Length = GRIP_M
     """Side of the pad, or of the square that a pivot represents."""
     grip_known_within: Annotated[float, Field(ge=1, le=3)] = 1.0
-    """Uncertainty of `grip_m`: one standard deviation as a factor; 1: exact. Fits by `likelihood` take it into
-    account."""
+    """Standard deviation of `grip_m` as a factor; 1: exact. Fits by `likelihood` take it into account."""
     loss_surface: Literal["all", "grasped_half"] = "all"
     initial_state: Annotated[str, Field(max_length=200)] = "turn=10deg"
     """Standard deviations of the deviations from the initial state, which fits estimate: `turn` about the cloth's
@@ -226,8 +225,7 @@ _Pad = tuple[NDArray[np.float64], NDArray[np.float64]]
 def _pads(
     options: GridScenario, places: Sequence[Sequence[int]]
 ) -> tuple[list[NDArray[np.float64]], list[list[_Pad]] | None]:
-    """Return grid lines along x and y, and the pads of each gripper. With pivots, lines are uniform and there are no
-    pads."""
+    """Return grid lines along x and y, and the pads of each gripper (uniform lines and None for pivots)."""
     uniform = [np.linspace(0, side, count) for side, count in zip(options.size_m, options.nodes, strict=True)]
     if options.grip == "pivot":
         return uniform, None
@@ -256,8 +254,7 @@ def _pads(
 
 
 def _lines(options: GridScenario, axis: int, ends: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the grid lines along an axis: at the cloth's edges and the pads' ends, and as uniform as possible in
-    between."""
+    """Return the grid lines along an axis: at the cloth's edges and the pads' ends, as uniform as possible between."""
     length, count, name = options.size_m[axis], options.nodes[axis], "xy"[axis]
     breaks = np.unique(np.round([0.0, length, *ends], 9))
     gaps = np.diff(breaks)

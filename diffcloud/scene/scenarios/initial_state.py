@@ -1,5 +1,4 @@
-"""Parsing of initial-state deviations such as turn=10deg,shape=5mm. `estimation.initial_state` explains the variables
-and fits them."""
+"""Parsing of initial-state deviations such as turn=10deg,shape=5mm. `estimation.initial_state` fits them."""
 
 from __future__ import annotations
 

@@ -28,8 +28,7 @@ _FLAT_M = 0.05
 _RIM = 0.005
 """Fraction of the points that may be outside each side of the rectangle: noise and stray points."""
 _SIZE_OFF = 0.2
-"""Maximum relative difference between estimated and stated size. A larger one indicates another cloth, or a part of
-one."""
+"""Maximum relative difference between estimated and stated size. A larger one indicates another cloth."""
 _LEVEL_M = 0.015
 """Height range around the first frame in which points may still be on the table."""
 _STRETCHED = 1.2
@@ -73,8 +72,7 @@ def found_size(episode: Episode) -> tuple[float, float]:
 
 
 def node_counts(size: tuple[float, float]) -> tuple[int, int]:
-    """Return the numbers of nodes along both sides, 13 along the longer one. Coarser meshes buckle and fold
-    differently."""
+    """Return the numbers of nodes along both sides, 13 along the longer one. Coarser meshes fold differently."""
     columns, rows = (max(round((_NODES[1] - 1) * side / max(size)) + 1, _NODES[0]) for side in size)
     return columns, rows
 

@@ -41,8 +41,7 @@ class ScenarioOptions(Checked):
     """Fields that all built-in scenarios share (SI units)."""
 
     name: Annotated[str, Field(min_length=1, max_length=200, pattern=r"^[^./\\\s][^/\\]*$")]
-    """Name of folders and files. The pattern allows every name of a recording, because `fit` names its scenario after
-    it."""
+    """Name of folders and files. Every name of a recording is allowed, because `fit` uses it for the scenario."""
     material: str | Sheet = "soft-knit"
     """A preset, the path of an ARCSim material JSON, or an isotropic sheet in SI units."""
     compression: Annotated[float, Field(ge=0, le=1)] = 1.0
@@ -82,8 +81,7 @@ class ScenarioOptions(Checked):
     mesh_contact: bool = True
     """For the arcsim integrator: contact with all meshes and the cloth itself, or with planes only."""
     self_contact: bool = Surrounding.self_contact
-    """Whether the cloth collides with itself. Without, layers pass through each other, and steps are several times
-    faster."""
+    """Whether the cloth collides with itself. Without, layers pass through each other, and steps are faster."""
     contact_stiffness: NonNegative = ContactSettings.stiffness
     contact_thickness_m: Annotated[float, Field(gt=0, le=1)] = ContactSettings.repulsion_thickness
 

@@ -20,8 +20,7 @@ from diffcloud.sim.system import System
 _NO_MATERIAL = 1e-9
 """Smaller values are treated as zero."""
 Recorder = Literal["depth_cameras", "whole_surface"]
-"""Source of synthetic episodes: depth cameras with noise, or noise-free points on the whole cloth and the first
-obstacle."""
+"""Source of synthetic episodes: depth cameras with noise, or noise-free points on cloth and first obstacle."""
 
 
 @dataclass(frozen=True)
@@ -188,8 +187,7 @@ class Scenario:
         )
 
     def value(self, name: str) -> float:
-        """Return a parameter's simulator input in this scenario (1 for multipliers); zero if it has no effect in the
-        scene."""
+        """Return a parameter's simulator input in this scenario (1 for multipliers); zero if it has no effect."""
         quantity = PARAMETERS[name].quantity
         if quantity is not None:
             return 1.0 if self.scene.nominal(quantity) > _NO_MATERIAL else 0.0

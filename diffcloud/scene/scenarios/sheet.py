@@ -14,8 +14,7 @@ _SOLID = ("density_kg_m3", "youngs_modulus_pa", "thickness_m")
 
 
 class Sheet(Checked):
-    """An isotropic material, from tests of a fabric strip or from the properties of a solid sheet (rubber, foam,
-    paper)."""
+    """An isotropic material, from tests of a fabric strip or from the properties of a solid sheet such as rubber."""
 
     density_kg_m2: Positive | None = None
     stretching_n_m: Positive | None = None

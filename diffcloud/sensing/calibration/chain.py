@@ -176,8 +176,7 @@ class _Standing:
 def in_camera(
     T_world_camera: Floats, T_world_gripper: Floats, T_gripper_board: Floats, poses: Integers, points: Floats
 ) -> Floats:
-    """Transform board points [N, 3] to the camera's frame, each at the gripper pose with index `poses` [N] of [P, 4,
-    4]."""
+    """Transform board points [N, 3] to the camera's frame. `poses` [N] are indices of gripper poses [P, 4, 4]."""
     chain = (inverse(T_world_camera) @ T_world_gripper @ T_gripper_board)[poses]
     return np.einsum("nij,nj->ni", chain[:, :3, :3], points) + chain[:, :3, 3]
 

@@ -123,8 +123,7 @@ class CameraViews:
 
 
 def board_in_camera(view: View, corners: Floats, intrinsics: Intrinsics) -> Floats:
-    """Return T_camera_board [4, 4] from one view (perspective-n-point); `corners` [K, 3] are in the board's frame
-    [m]."""
+    """Return T_camera_board [4, 4] from one view (perspective-n-point), with board corners [K, 3] [m]."""
     import cv2
 
     # undistort first, in the camera's own convention
@@ -138,8 +137,7 @@ def board_in_camera(view: View, corners: Floats, intrinsics: Intrinsics) -> Floa
 
 
 def depth_at(depth: NDArray[np.uint16], pixels: Floats) -> Floats:
-    """Return the median [N] of the valid depths in 3 x 3 pixels around each of `pixels` [N, 2]; NaN if there are
-    none."""
+    """Return the median [N] of the valid depths in 3 x 3 pixels around `pixels` [N, 2]; NaN without any."""
     column, row = np.rint(pixels).astype(int).T
     offset = np.arange(-1, 2)
     rows = (row[:, None, None] + offset[:, None]).clip(0, depth.shape[0] - 1)

@@ -32,8 +32,7 @@ class Registration:
     residual_m: Floats
     """[N] distances of the transformed plane points to the robot's corners."""
     scale: float
-    """Size of the robot's board divided by that in the camera: 1 for a correct depth scale. The transform does not
-    include it."""
+    """Size of the robot's board divided by that in the camera; 1 is correct. The transform does not include it."""
 
     @property
     def rms_m(self) -> float:

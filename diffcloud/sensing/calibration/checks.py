@@ -41,8 +41,7 @@ ADVISED_POSES = 15
 LARGEST_ERROR_MM = 10.0
 """Maximum held-out error."""
 _LARGEST_TURN_DEG = 5.0
-"""Maximum difference between the rotations of arm and board, median over pairs of poses. Correct ones differ by tenths
-of a degree."""
+"""Maximum median difference between rotations of arm and board. Correct ones differ by tenths of a degree."""
 _HINT, _WRONG = 0.01, 0.02
 """Relative errors for a warning and for an objection. Two percent at 1 m are 20 mm of depth. A board wrong by two
 percent moves a camera by 13 mm."""
@@ -282,8 +281,7 @@ def _common(values: list[float]) -> float | None:
 
 
 def _turn_mismatch_deg(board: Rotation, arm: Rotation) -> float:
-    """Return the median difference between the rotations of board and arm over all pairs of poses, after axis
-    alignment."""
+    """Return the median difference between rotations of board and arm over pairs of poses, after axis alignment."""
     one, other = np.triu_indices(len(board), 1)
     seen, told = ((turns[one].inv() * turns[other]).as_rotvec() for turns in (board, arm))
     with warnings.catch_warnings():

@@ -145,8 +145,7 @@ def exchanged_cameras(cameras: list[RecordedCamera], folder: Path, calibration: 
 
 
 def _plane(cloud: NDArray[np.float64]) -> NDArray[np.float64] | None:
-    """Return the unit normal [3] of the plane with the most points; None if it has less than a third of them.
-    Seeded."""
+    """Return the unit normal [3] of the plane with the most points; None if it has less than a third of them."""
     rng = np.random.default_rng(0)
     corners = cloud[rng.integers(len(cloud), size=(_PLANES, 3))]
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
