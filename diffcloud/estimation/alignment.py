@@ -1,4 +1,4 @@
-"""The pose that a simulated motion is compared at: the one of lowest loss, by Gauss and Newton's steps."""
+"""Pose of lowest loss at which a simulated motion is compared, found by Gauss–Newton steps."""
 
 from __future__ import annotations
 
@@ -10,25 +10,23 @@ from torch import Tensor
 from diffcloud.estimation.pose import PoseSpace
 
 Terms = Callable[[Tensor, float, Tensor | None], tuple[Tensor, Tensor, Tensor]]
-"""Poses [b, d], a factor of the cap, and which entries [b] of the batch they belong to (None: all) -> loss [b], half of its
-slope [b, d] and of its curvature [b, d, d]."""
+"""Function that returns the loss [b], half its gradient [b, d] and half its Hessian approximation [b, d, d]. Its
+arguments are poses [b, d], a factor of the distance cap, and the batch entries [b] of the poses (None: all)."""
 _LARGEST = 300.0
-"""Step, in what is resolved (`PoseSpace.resolved`)."""
+"""Maximum step, in multiples of `PoseSpace.resolved`."""
 _DAMPING = 1e-6
 
 
 def aligned(space: PoseSpace, start: Tensor, terms: Terms, caps: Sequence[float]) -> Tensor:
-    """[B, d] poses that steps from `start` [B, d] lead to, each one on the loss with another factor of the cap.
-
-    An entry of the batch stops early once the factor is 1 and its step is small, whatever the others do. The scale stays
-    until then: a scene that lies elsewhere comes nearer as it shrinks.
-    """
+    """Return poses [B, d] after one Gauss–Newton step from `start` [B, d] for each factor of the distance cap in
+    `caps`. A batch entry stops early if the factor is 1 and its step is small. The scale is held fixed while the factor
+    is not 1, because shrinking the scene would otherwise make up for a position error."""
     poses, going = start.clone(), torch.arange(len(start))
     eye = torch.eye(len(space.names), dtype=torch.float64)
     unscaled = space.unscaled
     for cap in caps:
         loss, slope, curvature = terms(poses[going], cap, None if len(going) == len(start) else going)
-        # without a cap, a frame in which no place counts has an infinite loss; there, no prior holds the pose
+        # without a cap, a frame without visible points has an infinite loss; the prior is then omitted
         prior = torch.where(loss.isfinite(), loss, 0.0)[:, None] * space.prior_weights
         slope, curvature = slope + prior * poses[going], curvature + torch.diag_embed(prior)
         if cap != 1.0:

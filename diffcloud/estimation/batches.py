@@ -1,4 +1,4 @@
-"""Batches of parameter sets of which some may diverge."""
+"""Evaluation of batches of parameter sets, some of which may diverge."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ T = TypeVar("T")
 
 
 def without_diverged(count: int, run: Callable[[Tensor], T]) -> tuple[T | None, Tensor, dict[int, str]]:
-    """Run a batch, without the entries that diverge.
+    """Run a batch repeatedly until no entry diverges, dropping the diverged entries.
 
     Args:
-        count: B entries.
-        run: takes the indices [b] of the entries still in the batch; raises DivergedError.
+        count: number of entries B.
+        run: function of the indices [b] of the remaining entries. Raises DivergedError.
 
     Returns:
-        What `run` gave (None if nothing is left), the indices [b] that it was given, and entry -> message of the others.
+        The result of `run` (None if no entry is left), the remaining indices [b], and dropped entry -> message.
     """
     kept, lost = torch.arange(count), dict[int, str]()
     while len(kept):
@@ -39,16 +39,16 @@ def without_diverged(count: int, run: Callable[[Tensor], T]) -> tuple[T | None, 
 
 
 def posterior_losses(objective: AnyObjective, space: FitSpace, values: Tensor) -> Tensor:
-    """[B, k] values -> [B] losses with the priors; differentiable.
+    """Return losses [B] of values [B, k], multiplied by the prior factors; differentiable.
 
     Raises:
-        DivergedError: names step and batch entries.
+        DivergedError: a simulation diverged; names the step and the batch entries.
     """
     return objective(space.parameters(values)) * space.prior_factor(values, len(objective.members))
 
 
 def batch_losses(objective: AnyObjective, space: FitSpace, values: Tensor) -> Tensor:
-    """The same without a gradient; infinite where the simulation diverges."""
+    """Return `posterior_losses` without gradients; infinite if the simulation diverges."""
     losses = torch.full((len(values),), math.inf, dtype=values.dtype)
     with torch.no_grad():
         found, kept, _ = without_diverged(len(values), lambda index: posterior_losses(objective, space, values[index]))

@@ -1,4 +1,4 @@
-"""Quadratic functions between bounds."""
+"""Minimisation of quadratic functions between bounds."""
 
 from __future__ import annotations
 
@@ -6,11 +6,12 @@ import torch
 from torch import Tensor
 
 _LEAST_SPREAD = 1e-12
-"""Of the eigenvalues of a matrix to its largest."""
+"""Smallest allowed ratio of an eigenvalue to the largest one."""
 
 
 def lowest_within(matrix: Tensor, slope: Tensor, least: Tensor, most: Tensor) -> Tensor:
-    """[k] where slope · s + s · matrix s / 2 is lowest between `least` and `most` [k], of a positive matrix [k, k]."""
+    """Return the minimiser [k] of slope · s + s · matrix s / 2 between `least` and `most` [k]. `matrix` [k, k] must be
+    positive semidefinite."""
     from scipy.optimize import lsq_linear  # slow to import
 
     spread, axes = torch.linalg.eigh(matrix)

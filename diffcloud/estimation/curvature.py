@@ -1,4 +1,4 @@
-"""The sums over all pairs from which a pose is found, in a kernel. What they mean: `estimation.matching`."""
+"""Compiled kernel of the sums over all pairs for the pose search. `estimation.matching` explains the terms."""
 
 from __future__ import annotations
 
@@ -11,50 +11,50 @@ from diffcloud.sim.compiled.data import Floats, Ints
 
 
 class Surfaces(NamedTuple):
-    """B motions of V nodes at L frames, V / C nodes for each of C clocks. Axis B or L of velocities has length one where
-    all motions, or all frames, share them."""
+    """B motions of V nodes at L frames, with V / C nodes for each of C clocks. Axis B or L of the velocities has length
+    one if all motions or frames share them."""
 
     nodes: Floats
-    """[B, L, V, 3]"""
+    """[B, L, V, 3] node positions."""
     velocities: Floats
-    """Likewise; empty: none."""
+    """[B, L, V, 3], or empty without velocities."""
 
 
 class Placements(NamedTuple):
-    """Where B poses put a scene in the recording, matrix (x + lag v - centre) + shift, and its derivatives by the d
-    variables of the pose (`estimation.pose`)."""
+    """B poses x' = matrix (x + lag v - centre) + shift, and their derivatives by the d pose variables
+    (`estimation.pose`)."""
 
     centre: Floats
-    """[3]"""
+    """[3] centre of the recording."""
     matrix: Floats
-    """[B, 3, 3]"""
+    """[B, 3, 3] scaled rotations."""
     shift: Floats
-    """[B, 3]"""
+    """[B, 3] shifts, including the centre."""
     lag: Floats
-    """[B, C]"""
+    """[B, C] lag of each clock relative to its stated offset [s]."""
     matrix_rates: Floats
-    """[d, B, 3, 3]"""
+    """[d, B, 3, 3] derivatives of `matrix`."""
     shift_rates: Floats
-    """[d, 3]"""
+    """[d, 3] derivatives of `shift`."""
     lag_rates: Floats
-    """[d, C]"""
+    """[d, C] derivatives of `lag`."""
 
 
 class Partners(NamedTuple):
-    """N pairs in each frame. Where all motions, or all frames, share them, axis B or L has length one."""
+    """N pairs of a surface point and a recorded point per frame. Shared values have length one along axis B or L."""
 
     corners: Ints
-    """[B, L, N, 3] nodes of the face on which a place lies, all of one clock."""
+    """[B, L, N, 3] nodes of the face that contains the surface point, all of one clock."""
     barycentric: Floats
-    """[B, L, N, 3] where on it."""
+    """[B, L, N, 3] barycentric coordinates of the surface point in its face."""
     points: Floats
-    """[B, L, N, 3] recorded."""
+    """[B, L, N, 3] recorded points."""
     normals: Floats
-    """[B, L, N, 3] of the surface along which a pair may slide, in the recording; empty: those of the faces."""
+    """[B, L, N, 3] normals of the recorded surface, along which a pair may slide. Empty: use the face normals."""
     weights: Floats
-    """[B, L, N]"""
+    """[B, L, N] weights of the pairs."""
     spacing: Floats
-    """[L] between recorded points."""
+    """[L] distance between neighbouring recorded points."""
 
 
 @kernel
@@ -68,11 +68,12 @@ def sum_terms(
     slope: Floats,
     curvature: Floats,
 ) -> None:
-    """Add up the loss [B], half of its slope [B, d] and of its curvature [B, d, d], by the pose.
+    """Add the loss [B], half its gradient [B, d] and half its Hessian approximation [B, d, d] in the pose to the
+    outputs.
 
     Args:
-        cap: largest distance that counts as itself.
-        hidden: loss of a frame in which no place counts.
+        cap: distances are capped at this value.
+        hidden: loss of a frame whose pairs all have zero weight.
     """
     each, count = surfaces.nodes.shape[2] // placements.lag.shape[1], len(placements.shift_rates)
     moves, own_normals = surfaces.velocities.size > 0, pairs.normals.size == 0
@@ -123,7 +124,7 @@ def sum_terms(
                 else:
                     n0, n1, n2 = normals[pair, 0], normals[pair, 1], normals[pair, 2]
                 height = x * n0 + y * n1 + z * n2
-                t0, t1, t2 = x - height * n0, y - height * n1, z - height * n2  # sqrt(w) t, once it is divided
+                t0, t1, t2 = x - height * n0, y - height * n1, z - height * n2  # becomes sqrt(w) t after the division
                 size = np.sqrt(t0 * t0 + t1 * t1 + t2 * t2 + pairs.spacing[f] * pairs.spacing[f])
                 if size > 0.0:
                     t0, t1, t2 = t0 / size, t1 / size, t2 / size
@@ -148,13 +149,13 @@ def sum_terms(
 
 @kernel
 def _of(values: Any, motion: int, frame: int) -> Any:
-    """[N, ...] of one frame of one motion."""
+    """Return the values [N, ...] of one frame of one motion; axes of length one are shared."""
     return values[min(motion, values.shape[0] - 1), min(frame, values.shape[1] - 1)]
 
 
 @kernel
 def _inside(values: Floats, i: int, j: int, k: int, u: float, v: float, w: float) -> tuple[float, float, float]:
-    """Of values [V, 3] at three nodes, that of a place between them."""
+    """Interpolate values [V, 3] of three nodes with barycentric coordinates."""
     return (
         u * values[i, 0] + v * values[j, 0] + w * values[k, 0],
         u * values[i, 1] + v * values[j, 1] + w * values[k, 1],
@@ -164,7 +165,7 @@ def _inside(values: Floats, i: int, j: int, k: int, u: float, v: float, w: float
 
 @kernel
 def _across(nodes: Floats, velocities: Floats, lag: float, i: int, j: int, k: int) -> tuple[float, float, float]:
-    """Normal of a face after a lag, as long as twice its area. Without velocities, the lag is zero."""
+    """Return the normal of a face after a lag, with twice the face's area as its length."""
     a0, a1, a2 = nodes[j, 0] - nodes[i, 0], nodes[j, 1] - nodes[i, 1], nodes[j, 2] - nodes[i, 2]
     b0, b1, b2 = nodes[k, 0] - nodes[i, 0], nodes[k, 1] - nodes[i, 1], nodes[k, 2] - nodes[i, 2]
     if lag != 0.0:
@@ -175,7 +176,7 @@ def _across(nodes: Floats, velocities: Floats, lag: float, i: int, j: int, k: in
 
 
 def compile_terms() -> None:
-    """Compile what finding a pose needs."""
+    """Compile the kernel for the pose search."""
     points = np.zeros((1, 1, 3, 3))
     surfaces = Surfaces(points, points)
     placements = Placements(

@@ -1,16 +1,18 @@
-"""How a cloth lies when its motion begins: turned under the gripper, not quite flat, and not quite as large as stated.
+"""Initial state of the cloth: rotated under the gripper, not quite flat, or not exactly of the stated size.
 
-The pose (`estimation.pose`) moves cloth, gripper and bodies together, which is the same motion seen from elsewhere. A
-cloth that a hand has put down 5° askew, or with a rim that stands up, moves in another way, and so does a larger one.
-So these are variables of the motion, like uncertain material (`estimation.uncertain`): fitted under priors, and no property
-of the material. In a joint fit, each recording has its own, except for the size, which belongs to the cloth.
+The pose (`estimation.pose`) moves cloth, gripper and bodies together, so the motion itself stays the same. A cloth that
+was put down with a rotation of 5° or a raised rim moves differently, and so does a larger cloth. The initial state
+therefore consists of variables of the motion, like uncertain material (`estimation.uncertain`). They are fitted under
+priors and are no material properties. In a joint fit each recording has its own, except for the size, which belongs to
+the cloth.
 
-The turn is about the cloth's middle. Its height over the scene's is a sum of nine waves over the cloth,
+`turn` rotates the cloth about its centre. The height relative to the scene's cloth is a sum of nine waves,
 
     h(u, v) = Σ c_ij cos(π i u) cos(π j v),      u, v in [0, 1],      0 < i + j <= 3,
 
-raised until no node is lower than before. `size` and `track` are logarithms: of how many times as large as the scene's the
-cloth is, and of how many times as far as recorded the gripper goes. What they do to a motion: `estimation.inputs`.
+raised so that no node is lower than before. `size` is the logarithm of the cloth's size relative to the scene. `track`
+is the logarithm of the length of the gripper's path relative to the recording. `estimation.inputs` explains their
+effect on the motion.
 """
 
 from __future__ import annotations
@@ -31,21 +33,19 @@ from diffcloud.scene.scenarios.initial_state import INITIAL_STATE
 
 _SHAPES = {f"shape_{i}_{j}": (i, j) for i in range(4) for j in range(4) if 0 < i + j <= 3}
 _FLAT = 1e-6
-"""Part of its size by which a level cloth may be off."""
+"""A cloth counts as level if its height range is below this fraction of its size."""
 _FARTHEST = 4.0
-"""Bounds, in standard deviations."""
+"""Bounds of the variables, in standard deviations."""
 
 
 def with_initial_state(space: FitSpace, stated: Sequence[Mapping[str, float]], scenarios: Sequence[Scenario]) -> FitSpace:
-    """The space with the variables appended.
+    """Append the variables of the initial state to a space.
 
     Args:
-        stated: for each recording, name -> standard deviation [m, rad, 1]. `size` belongs to all: its
-            largest holds.
-        scenarios: of the recordings.
+        stated: for each recording, name -> standard deviation [m, rad, 1]. The largest one of `size` applies to all.
 
     Raises:
-        ConfigError: a cloth that does not lie level, or a size where there is more than a table around the cloth.
+        ConfigError: a cloth does not start level, or `size` is requested in a scene with more than a level table.
     """
     sizes = [own["size"] for own in stated if "size" in own]
     deviations: list[dict[str, float]] = []
@@ -67,10 +67,10 @@ def variables_of(described: Sequence[Mapping[str, NuisanceValue]], *, length_uni
     """Return the variables that `described_initial_state` describes.
 
     Args:
-        described: of each recording; other nuisance is passed over.
+        described: nuisance values of each recording; pose variables are ignored.
 
     Raises:
-        ConfigError: an unknown one.
+        ConfigError: a variable is unknown.
     """
     every = [{name: entry.prior for name, entry in one.items() if entry.of == "cloth"} for one in described]
     for name in (name for one in every for name in one):
@@ -82,9 +82,10 @@ def variables_of(described: Sequence[Mapping[str, NuisanceValue]], *, length_uni
 
 
 def _variables(deviations: Sequence[Mapping[str, float]], *, length_unit_m: float) -> list[Variable]:
-    """
+    """Return the variables of a fit.
+
     Args:
-        deviations: for each recording, name of a variable -> [m, rad, 1].
+        deviations: for each recording, name of a variable -> standard deviation [m, rad, 1].
     """
     return [_variable(name, deviation, length_unit_m) for name, deviation in of_all(deviations).items()]
 
@@ -112,9 +113,10 @@ def check_resizable(scenario: Scenario) -> None:
 
 
 def _variable(name: str, deviation: float, length_unit_m: float) -> Variable:
-    """
+    """Return one variable with a normal prior about zero.
+
     Args:
-        deviation: [m, rad, 1].
+        deviation: standard deviation [m, rad, 1].
     """
     deviation /= length_unit_m if INITIAL_STATE[asked_as(name)] == "m" else 1.0
     return Variable(
@@ -123,23 +125,23 @@ def _variable(name: str, deviation: float, length_unit_m: float) -> Variable:
 
 
 def is_initial_state(name: str) -> bool:
-    """Whether a variable tells how a cloth lies."""
+    """Return whether a variable belongs to the initial state."""
     plain = plain_name(name)
     return plain in _SHAPES or (plain in INITIAL_STATE and plain != "shape")
 
 
 def asked_as(name: str) -> str:
-    """The name in `INITIAL_STATE` under which a variable is requested; of any other, its own."""
+    """Return the key in `INITIAL_STATE` under which a variable is requested; other names are returned unchanged."""
     plain = plain_name(name)
     return "shape" if plain in _SHAPES else plain
 
 
 def sizes_of(values: Mapping[str, Tensor]) -> tuple[Tensor | None, Tensor | None]:
-    """[B] how many times as large as the scene's a cloth is, and how many times as far its gripper goes, in units of its
-    size; differentiable. None: as large, as far.
+    """Return the cloth's size relative to the scene [B], and the length of the gripper's path in units of this size
+    [B]. Both are differentiable; None stands for 1.
 
     Args:
-        values: name -> [B], those of the material too.
+        values: name -> [B], also of other variables.
     """
     size, track = values.get("size"), values.get("track")
     if size is None:
@@ -148,10 +150,10 @@ def sizes_of(values: Mapping[str, Tensor]) -> tuple[Tensor | None, Tensor | None
 
 
 def initial_nodes(mesh: ClothMesh, values: Mapping[str, Tensor]) -> Tensor | None:
-    """[B, V, 3] where a cloth starts, at the scene's size; differentiable. None: as the scene has it.
+    """Return the initial node positions [B, V, 3] at the scene's size, differentiable. None: the scene's own positions.
 
     Args:
-        values: name -> [B], those of the material too.
+        values: name -> [B], also of other variables.
     """
     own = {name: value for name, value in values.items() if is_initial_state(name)}
     if not own:
@@ -182,7 +184,7 @@ def initial_nodes(mesh: ClothMesh, values: Mapping[str, Tensor]) -> Tensor | Non
 def described_initial_state(
     space: FitSpace, values: Mapping[str, float], *, length_unit_m: float
 ) -> dict[str, NuisanceValue]:
-    """Values as records keep them: name -> value and its prior, in SI."""
+    """Convert values to the form of the fit record: name -> value and prior, in SI units."""
     found = {}
     for variable in space.variables:
         if variable.deviation is not None:
@@ -194,7 +196,7 @@ def described_initial_state(
 
 
 def _unit_square(mesh: ClothMesh) -> tuple[Tensor, Tensor]:
-    """[V] where each node is on the cloth, across and along, from 0 to 1."""
+    """Return two coordinates [V] of each node in the flat cloth, scaled to the range 0 to 1."""
     places = np.empty((len(mesh.nodes), 2))
     places[mesh.vert_node] = mesh.verts
     low = places.min(0)

@@ -1,17 +1,17 @@
-"""From parameter sets to the simulator's inputs, and from its motion to what a cloth of another size does.
+"""Simulator inputs of parameter sets, and the scaling of motions for a cloth of another size.
 
-A cloth s times as large as the scene's, x = c + s (ξ - c), moves as the scene's own cloth ξ does where
+A cloth s times as large as the scene's, x = c + s (ξ - c), moves like the scene's own cloth ξ if
 
     stretching is k / s²,  bending B / s⁴,  gravity g / s,  air density ρ s,  added mass m s,
     and the gripper's displacement u / s.
 
-Written in ξ, inertia gains a factor s⁴, weight s³, the energy of stretching s², that of bending none, and the work of
-quadratic drag and the inertia of the air s⁵; all is divided by s⁴. Linear drag gains what inertia does; shear, compression
-and friction are ratios, and damping is a time. So the mesh and all that is computed from it stay.
+Written in ξ, inertia gains a factor s⁴, weight s³, stretching energy s² and bending energy 1. The work of quadratic
+drag and the inertia of the air gain s⁵. All terms are then divided by s⁴. Linear drag scales like inertia. Shear,
+compression and friction are ratios, and damping is a time. So the mesh and everything computed from it stay the same.
 
-c is below the cloth's middle, on the table, so the table does not move. The grasped nodes do, and the pose takes that up.
-Contact and the gap below the cloth are s times as thick, soft handles s² times as stiff, and a bending table is read at a
-curvature s times too large: for sizes off by a few percent, this hardly matters.
+c is below the centre of the cloth, on the table, so the table does not move. The grasped nodes do move, which the pose
+compensates. Three quantities become wrong: the contact thickness (s times too large), the stiffness of soft handles
+(s²), and the curvature at which a bending table is read (s). For size changes of a few percent this is negligible.
 """
 
 from __future__ import annotations
@@ -32,30 +32,29 @@ from diffcloud.sim.system import State, System
 
 @dataclass(frozen=True)
 class Inputs:
-    """Of B motions of a cloth over some steps, at the scene's size."""
+    """Simulator inputs of B motions over a number of steps, at the scene's size."""
 
     system: System
     steps: int
     properties: Properties
     state: State | None
-    """At the start; None: that of the scene."""
+    """State at the start; None: that of the scene."""
     track: Tensor | None
-    """[B, S, G, 3] displacement of the grippers; None: the scene's own motion."""
+    """[B, S, G, 3] gripper displacements; None: the scene's own motion."""
     size: Tensor | None
-    """[B] how many times as large the cloth is; None: as large."""
+    """[B] size of the cloth relative to the scene; None: the same size."""
 
     @staticmethod
     def of(scenario: Scenario, system: System, steps: int, values: Mapping[str, Tensor], track: Tensor | None) -> Inputs:
-        """Of parameter sets.
+        """Return the inputs of parameter sets.
 
         Args:
-            system: of the scenario's scene.
-            values: name -> [B], of parameters and of how the cloth lies (`estimation.initial_state`).
-            track: [1, S or more, G, 3] recorded displacement of the grippers [m]; None: the scene's own motion.
+            values: name -> [B], for parameters and initial-state variables (`estimation.initial_state`).
+            track: [1, S or more, G, 3] recorded gripper displacements, in scene units; None: the scene's own motion.
 
         Raises:
-            ConfigError: an unknown parameter, or a size where there is more around the cloth than a table.
-            SceneError: a size or a longer path, but neither a track nor a motion of the scene that is one.
+            ConfigError: a parameter is unknown, or a size is given for a scene with more than a level table.
+            SceneError: a size or path length is given, but neither the recording nor the scene has a gripper path.
         """
         size, reach = sizes_of(values)
         count = len(next(iter(values.values()))) if values else 1
@@ -83,19 +82,23 @@ class Inputs:
         return Inputs(system, steps, properties, state, track, size)
 
     def rollout(self, *, progress: Callable[[int], None] | None = None) -> Rollout:
-        """See `sim.rollout`."""
+        """Simulate the motions; see `sim.rollout`."""
         run = rollout(
             self.system, self.steps, properties=self.properties, state=self.state, track=self.track, progress=progress
         )
         return self._shown(run)
 
     def tensors(self) -> tuple[Tensor, ...]:
-        """[B, ...] all that may depend on what is fitted, with its derivatives."""
+        """Return the tensors [B, ...] that may depend on fitted variables, with their derivatives."""
         positions = None if self.state is None else self.state.positions
         return *self.properties.tensors(), *(one for one in (positions, self.track, self.size) if one is not None)
 
     def rollout_tangents(self, rates: Sequence[Tensor]) -> tuple[Rollout, Tensor]:
-        """The motions, and d positions [K, B, S + 1, V, 3] along rates [K · B, ...] of `tensors`, directions outermost."""
+        """Simulate the motions and their forward-mode derivatives d positions [K, B, S + 1, V, 3].
+
+        Args:
+            rates: [K · B, ...] derivatives of each of `tensors` in K directions, directions outermost.
+        """
         own = len(self.properties.tensors())
         further = iter(rates[own:])
         start, track, size = (None if one is None else next(further) for one in (self.state, self.track, self.size))
@@ -116,13 +119,13 @@ class Inputs:
 
     @property
     def _centre(self) -> Tensor:
-        """[3] that stays where it is."""
+        """[3] fixed point of the scaling."""
         mesh, obstacles = self.system.mesh, self.system.setup.surrounding.obstacles
         table = obstacles[0].nodes if obstacles else mesh.nodes
         return torch.as_tensor([*mesh.nodes[:, :2].mean(0), table[:, 2].mean()])
 
     def _shown(self, run: Rollout) -> Rollout:
-        """At the cloth's own size."""
+        """Scale a rollout to the size of the real cloth."""
         if self.size is None:
             return run
         size, centre = _beside(self.size), self._centre
@@ -130,5 +133,5 @@ class Inputs:
 
 
 def _beside(size: Tensor) -> Tensor:
-    """[B] -> [B, 1, 1, 1]"""
+    """Reshape [B] to [B, 1, 1, 1]."""
     return size[:, None, None, None]

@@ -1,13 +1,13 @@
 """One set of parameters for several recordings of one cloth, which may show different motions.
 
-How noisy a recording is, and how well the simulator can explain it, is not known beforehand and differs from one to the
-next. With a variance of its own for each, the likelihood of all is highest where the geometric mean of their losses is
-lowest:
+The residual level of a recording depends on its noise and on the model error. It is unknown and differs between
+recordings. If each recording has its own variance, the joint likelihood is maximal where the geometric mean of the
+losses is minimal:
 
     loss = (∏ loss_i)^(1/n)
 
-so that each counts by its own residual, and a part gained in one counts as in another. The measure of the paper takes the
-plain mean.
+A relative change of the loss then has the same weight in every recording. The loss of the paper uses the arithmetic
+mean.
 """
 
 from __future__ import annotations
@@ -32,9 +32,10 @@ class JointObjective:
     """Losses of a batch of parameter sets on several recordings."""
 
     def __init__(self, members: Sequence[Objective]) -> None:
-        """
+        """Combine the objectives of single recordings.
+
         Raises:
-            ConfigError: of different measures or length units, or of cloths that parameters do not mean the same in.
+            ConfigError: the objectives differ in loss, length unit or nominal material.
         """
         self.members = tuple(members)
         self.paper = members[0].paper
@@ -48,37 +49,38 @@ class JointObjective:
         return self.members[0].length_unit_m
 
     def __call__(self, parameters: Mapping[str, Tensor]) -> Tensor:
-        """Losses [B], as of `Objective`.
+        """Return losses [B]; see `Objective`.
 
         Args:
-            parameters: name -> [B]; what is one recording's own is named as `estimation.names` says.
+            parameters: name -> [B]; `estimation.names` explains the names of variables that belong to one recording.
         """
         own = [(one, of_recording(parameters, index)) for index, one in enumerate(self.members)]
         return mean_loss(torch.stack(map_threads(lambda pair: pair[0](pair[1]), own)), paper=self.paper)
 
     def earliest(self, counts: Sequence[int]) -> JointObjective:
-        """As of `Objective`, with a count for each."""
+        """See `Objective.earliest`, with one count per recording."""
         return JointObjective([one.earliest([count]) for one, count in zip(self.members, counts, strict=True)])
 
     def reseed(self, seed: int) -> None:
-        """Draw the common random numbers anew."""
+        """Sample new points on the cloth and in the clouds."""
         for one in self.members:
             one.reseed(seed)
 
 
 AnyObjective = Objective | JointObjective
-"""What a solver minimises: `members`, losses of parameters, `reseed`."""
+"""Function that a solver minimises."""
 
 
 def mean_loss(losses: Tensor, *, paper: bool) -> Tensor:
-    """[n, B] of n recordings -> [B]."""
+    """Average losses [n, B] over n recordings: geometric mean, or arithmetic mean for the loss of the paper."""
     return losses.mean(0) if paper or len(losses) == 1 else losses.clamp(min=_TINY).log().mean(0).exp()
 
 
 def check_same_cloth(first: Scenario, other: Scenario) -> None:
-    """
+    """Check that multipliers have the same meaning in two scenarios.
+
     Raises:
-        ConfigError: a multiplier does not mean the same in both; says which, and what it is in each.
+        ConfigError: they do not; names the parameter and its value in each scenario.
     """
     for told, one, two in (
         ("are in length units of", first.length_unit_m, other.length_unit_m),
@@ -99,5 +101,5 @@ def check_same_cloth(first: Scenario, other: Scenario) -> None:
 
 
 def _sets(scenario: Scenario) -> dict[str, int]:
-    """Parameter -> how many nodes it acts on, of those that act on a part of the cloth."""
+    """Return parameter -> number of nodes, for the parameters that act on a part of the cloth."""
     return {name: len(nodes) for name, nodes in scenario.node_sets.items()}

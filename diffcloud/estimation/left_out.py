@@ -1,7 +1,5 @@
-"""What the other recordings of a joint fit say of one: whether parameters carry over.
-
-A fit of the others begins where the joint one ended.
-"""
+"""Leave-one-out test of a joint fit: do parameters transfer to the recording that was left out? Each fit to the
+remaining recordings starts at the joint optimum."""
 
 from __future__ import annotations
 
@@ -20,8 +18,7 @@ from diffcloud.estimation.solvers import LikelihoodSettings, Progress, solve
 from diffcloud.sim.properties import one_set
 
 Tell = Callable[[float, str, Progress], None]
-"""What a progress display gets: the part of the recordings that have been left out, what is done now, and the progress of
-the current fit."""
+"""Progress callback of (fraction of recordings done, label, progress of the current fit)."""
 
 
 def leave_each_out(
@@ -32,18 +29,19 @@ def leave_each_out(
     *,
     progress: Tell | None = None,
 ) -> list[LeftOut]:
-    """For each recording: a fit to all others, from the joint optimum on, measured on it with its own pose, and with how
-    the cloth lay in it, which is fitted to it alone.
+    """Fit all recordings but one, from the joint optimum, and evaluate the parameters on that one; repeat for each.
+
+    Pose and initial state of the left-out recording are fitted to it alone.
 
     Args:
-        values: fitted to all, named as `estimation.names` says.
-        settings: of the joint fit.
+        values: jointly fitted values, named as `estimation.names` explains.
+        settings: settings of the joint fit.
 
     Raises:
         DivergedError: a motion diverges.
         KeyboardInterrupt: Ctrl-C.
     """
-    objective.reseed(settings.seed)  # a solver may have drawn other points
+    objective.reseed(settings.seed)  # a solver may have resampled the points
     told, count = [], len(objective.members)
     for index, member in enumerate(objective.members):
         shown = None if progress is None else partial(progress, index / count, f"leaving out {index + 1} of {count}")
@@ -56,7 +54,7 @@ def leave_each_out(
         with torch.no_grad():
             run = member.simulate_to_loss(one_set({**lying.fixed, **lies}))
             motion = member.match(run)
-            loss = float(member.losses(motion).mean())  # without the prior of the pose, as the joint fit's is told
+            loss = float(member.losses(motion).mean())  # without the pose prior, like the reported loss of the joint fit
             rms_mm = 1e3 * member.scenario.length_unit_m * float(member.squares(motion).mean()) ** 0.5
         parameters = {name: value for name, value in lying.fixed.items() if not is_initial_state(name)}
         told.append(LeftOut(loss=loss, rms_mm=rms_mm, parameters=parameters))
@@ -70,6 +68,6 @@ def _from(
     settings: LikelihoodSettings,
     progress: Callable[[Progress], None] | None,
 ) -> dict[str, float]:
-    """The fitted values at the end of a descent from these."""
+    """Return the fitted values of a single descent from the given values."""
     further = replace(settings, starts=1, init=values)
     return solve(objective, space, further, progress=progress).uninterrupted().values

@@ -1,21 +1,23 @@
-"""Pairs of a point of the simulated surface and a recorded one, in both directions, and what they say of a motion.
+"""Pairs of points of the simulated surface and recorded points, in both directions, and their loss.
 
-Forth, points sampled on the cloth look for the nearest recorded ones; back, recorded points look for the nearest place on
-the cloth, or on a body beside it. With r = x - y of such a pair, the loss is the weighted mean of |r|², each capped:
-a recorded point of something else, or a part of the cloth that no camera saw, then draws at nothing.
+In the direction "forth", each point sampled on the cloth is paired with the nearest recorded point. In the direction
+"back", each recorded point is paired with the nearest point on the cloth or on another body. With r = x - y of a pair,
+the loss is the weighted mean of |r|². Distances are capped, so outliers and unobserved parts of the cloth have no
+gradient.
 
-Half of its slope is the mean of r · ∂x. For its curvature, Gauss and Newton would take |∂x|², as if x were bound to y. But
-either is a sample of a surface, along which it may slide: with the surface's normal n, and r's own direction t along it,
+Half the gradient is the mean of r · ∂x. The Gauss–Newton Hessian would be |∂x|², as if x were bound to y. But the pair
+may slide along the surface that both points sample. With the surface normal n, and the direction t of r's tangential
+part,
 
     curvature = (n · ∂x)² + w (t · ∂x)²,      w = |r_t|² / (|r_t|² + s²),
 
-where s is the distance between recorded points. So w is small inside of the surface and near one where r leads beyond its
-rim. (Chen and Medioni 1992 minimise the first part alone.)
+where s is the distance between recorded points. So w is small inside the surface, and close to one where r points
+beyond its rim. (Point-to-plane registration, Chen and Medioni 1992, has the first term only.)
 
-Each camera may have a clock of its own. A motion holds its V nodes once for each of the C clocks, at the times of that
-clock, one set after the other. The nodes on which a place lies therefore name its clock. A recorded point belongs to its
-camera's clock. A sampled point is compared with the points of each clock, from its place at the time of that clock. Its
-partner is the nearest of all.
+Each camera may have its own clock. A motion then holds its V nodes C times, once at the times of each clock, one block
+after the other. The node indices of a surface point therefore identify its clock. A recorded point has the clock of its
+camera. A sampled point is paired with the nearest recorded point of all clocks, each compared at the time of that
+clock.
 """
 
 from __future__ import annotations
@@ -36,36 +38,37 @@ from diffcloud.estimation.targets import Target
 
 @dataclass(frozen=True)
 class Pairs:
-    """B motions, L frames, N pairs in each."""
+    """N pairs of a surface point and a recorded point, for B motions and L frames."""
 
     places: SurfacePoints
-    """[B, L, N] on the surface."""
+    """[B, L, N] points on the surface."""
     partners: Tensor
     """[B, L, N, 3] recorded points, in the recording's frame."""
     normals: Tensor | None
-    """[B, L, N, 3] of the surface along which a pair may slide, there too; None: those of the faces on which places lie."""
+    """[B, L, N, 3] normals of the recorded surface, along which a pair may slide. None: the face normals."""
     spacing: Tensor
-    """[L] between recorded points."""
+    """[L] distance between neighbouring recorded points."""
     weights: Tensor
-    """[B, L, N]"""
+    """[B, L, N] weights; zero if a pair is excluded."""
     share: float
-    """Of all weights in a frame; where no place counts, they are missing."""
+    """Sum of the weights in a frame that has any included pair."""
 
     def losses(self, moved: Tensor, cap: float) -> Tensor:
-        """[B, L] what fits minimise of these pairs, differentiable; its slope and curvature are in `estimation.curvature`.
+        """Return the losses [B, L] of these pairs, differentiable. `estimation.curvature` has gradient and Hessian.
 
         Args:
-            moved: [B, L, N, 3] the places in the recording's frame.
-            cap: largest distance that counts as itself.
+            moved: [B, L, N, 3] the surface points in the recording's frame.
+            cap: distances are capped at this value.
         """
         return self.squares(moved, cap)
 
     def squares(self, moved: Tensor, cap: float) -> Tensor:
-        """[B, L] sums of the weighted squared distances, each capped: what `rms_mm` is the root of, whatever the loss. A
-        frame in which no place counts has the largest sum: a motion that hides from the recording explains nothing.
+        """Return weighted sums [B, L] of the capped squared distances; `rms_mm` is the root of their mean.
+
+        A frame without included pairs gets the maximum, since a motion that is out of view does not fit the recording.
 
         Args:
-            moved, cap: as of `losses`.
+            moved, cap: see `losses`.
         """
         found = (self.weights * (moved - self.partners).square().sum(-1).clamp(max=cap**2)).sum(-1)
         return torch.where(self.weights.sum(-1) > 0, found, self.share * cap**2)
@@ -73,26 +76,26 @@ class Pairs:
 
 @dataclass(frozen=True)
 class Motion:
-    """B simulated motions at L frames, and how they lie in the recording."""
+    """B simulated motions at L frames, with their poses and pairs."""
 
     nodes: Tensor
-    """[B, L, C · V, 3] of the cloth and of the bodies beside it, for each clock, in the scene."""
+    """[B, L, C · V, 3] nodes of the cloth and the other bodies for each clock, in the scene's frame."""
     velocities: Tensor | None
-    """[B, L, C · V, 3], where a lag is free."""
+    """[B, L, C · V, 3] node velocities, if a lag is free."""
     pose: Tensor
-    """[B, d]"""
+    """[B, d] pose values."""
     pairs: tuple[Pairs, ...]
-    """Forth; in the default measure, back too."""
+    """Pairs from cloth to cloud; in the default loss also those from cloud to cloth."""
 
     def shown(self, space: PoseSpace) -> Tensor:
-        """[B, L, C · V, 3] where the nodes are when the recording looks at them."""
+        """Return the nodes [B, L, C · V, 3] at the times of the recorded frames, i.e. with the fitted lags."""
         return _shown(self.nodes, self.velocities, self.pose, space)
 
     def terms(self, space: PoseSpace, cap: float) -> tuple[Tensor, Tensor, Tensor]:
-        """Loss [B], half of its slope [B, d] and of its curvature [B, d, d], by the pose.
+        """Return the loss [B], half its gradient [B, d] and half its Hessian approximation [B, d, d] in the pose.
 
         Args:
-            cap: largest distance that counts as itself.
+            cap: distances are capped at this value.
         """
         from diffcloud.estimation.curvature import (  # numba takes a moment to import
             Partners,
@@ -118,7 +121,7 @@ class Motion:
         return loss, slope, curvature
 
     def _check(self, space: PoseSpace) -> None:
-        """Assert the shapes on which the kernel, which checks no bounds, relies."""
+        """Assert the shapes that the kernel requires, since the kernel checks no bounds."""
         batch, frames = self.nodes.shape[:2]
         assert self.pose.shape == (batch, len(space.names))
         assert not space.moves_clocks or self.velocities is not None
@@ -133,8 +136,11 @@ class Motion:
 
 
 def _array(tensor: Tensor, *axes: int) -> Any:
-    """The numbers of a tensor as an array; where it is contiguous, they share its memory. Of these axes, those along which
-    it was expanded have length one."""
+    """Return a tensor as an array, which shares its memory if the tensor is contiguous.
+
+    Args:
+        axes: these axes get length one where the tensor was expanded.
+    """
     for axis in axes:
         if tensor.stride(axis) == 0 and tensor.shape[axis] > 1:
             tensor = tensor.narrow(axis, 0, 1)
@@ -143,18 +149,18 @@ def _array(tensor: Tensor, *axes: int) -> Any:
 
 @dataclass(frozen=True)
 class Recorded:
-    """Q recorded points of each of L frames that look for the cloth, those of one clock after those of another."""
+    """Q recorded points per frame that are paired with the cloth, for L frames, ordered by clock."""
 
     points: Tensor
-    """[L, Q, 3]"""
+    """[L, Q, 3] points in the recording's frame."""
     sure: Tensor
-    """[L, Q] how much each counts."""
+    """[L, Q] weight of each point."""
     counts: tuple[int, ...]
-    """[C] how many of them are of each clock."""
+    """[C] number of points of each clock."""
 
 
 class Matcher:
-    """Finds the pairs of B motions at one pose after the other: what was found last helps to find what is next."""
+    """Finds the pairs of B motions at a sequence of poses. The previous result speeds up each search."""
 
     def __init__(
         self,
@@ -167,14 +173,15 @@ class Matcher:
         *,
         near: float,
     ) -> None:
-        """
+        """Store the motions and the recorded points.
+
         Args:
-            target: of L frames.
-            nodes: [B, L, C · V, 3]; velocities likewise, where a lag is free.
-            places: [B, L, N] sampled on the cloth.
-            faces: [F, 3] of the cloth, and of bodies beside it.
-            recorded: points that look for the cloth; None where none do.
-            near: what is nearer to a point hides nothing.
+            target: the recording, at L frames.
+            nodes: [B, L, C · V, 3] nodes.
+            velocities: [B, L, C · V, 3] velocities; needed if a lag is free.
+            places: [B, L, N] points sampled on the cloth.
+            recorded: points to pair with the cloth; None for a one-sided loss.
+            near: surfaces closer to a point than this do not occlude it.
         """
         self._target, self._faces, self._near = target, faces, near
         self._nodes, self._velocities, self._places = nodes, velocities, places
@@ -183,10 +190,11 @@ class Matcher:
         self._found: list[Tensor | None] = [None, None]
 
     def __call__(self, pose: Tensor, entries: Tensor | None = None) -> Motion:
-        """The motions at poses [b, d], with their pairs.
+        """Return the motions at poses [b, d] with their pairs.
 
         Args:
-            entries: [b] of the motions; None for all, as the first time.
+            pose: [b, d] poses.
+            entries: [b] indices of the motions. None: all motions, as required in the first call.
         """
         target = self._target
         nodes, places = self._nodes, self._places
@@ -222,7 +230,7 @@ class Matcher:
         return Motion(nodes, velocities, pose, tuple(pairs))
 
     def _look(self, views: Sequence[Tensor], points: Sequence[Tensor], moved: Sequence[Tensor], pose: Tensor) -> Tensor:
-        """bool [B, L, N] which points [B, L, N, 3] any camera sees, each when its clock looks."""
+        """Return which points [B, L, N, 3] at least one camera sees at the time of its clock, bool [B, L, N]."""
         target = self._target
         assert target.viewpoints is not None
         eyes, seen = target.space.back(target.viewpoints, pose), torch.zeros_like(points[0][..., 0], dtype=torch.bool)
@@ -233,8 +241,8 @@ class Matcher:
         return seen
 
     def look_anew(self) -> None:
-        """Forget what the cameras saw at the first pose: so far away that the steps of a search change nothing of it, but a
-        loss at its end is that of its own pose."""
+        """Recompute visibility at the next pose. A pose search keeps the visibility of its first pose, since it hardly
+        changes. The final loss needs that of its own pose."""
         self._seen = None
 
     def _keep(self, way: int, found: Tensor, entries: Tensor | None) -> None:
@@ -257,7 +265,7 @@ def _shown(nodes: Tensor, velocities: Tensor | None, pose: Tensor, space: PoseSp
 
 
 def _by_clock(nodes: Tensor, space: PoseSpace) -> tuple[Tensor, ...]:
-    """[C] the nodes [B, L, V, 3] of each clock, of [B, L, C · V, 3]."""
+    """Split nodes [B, L, C · V, 3] into those of each clock, C tensors [B, L, V, 3]."""
     return nodes.chunk(len(space.clocks), dim=2)
 
 
@@ -273,17 +281,19 @@ def pairs_forth(
     seen: Tensor | None = None,
     guesses: Tensor | None = None,
 ) -> tuple[Pairs, Tensor]:
-    """Each place with the nearest recorded point of its frame, and the numbers of the nearest ones of each clock
-    [B, L, N, C].
+    """Pair each surface point with the nearest recorded point of its frame.
 
     Args:
-        moved: [C] where the places are in the recording's frame when each clock looks [B, L, N, 3].
-        clouds: [C][L] what was recorded by each clock.
-        nodes: of one clock; numbers of a later one's begin after those.
-        cut: places below this height do not count: the recording ends there.
-        share: of all weights.
-        seen: bool [B, L, N] which places a camera could see; None for all.
-        guesses: [B, L, N, C] points that may be near; they save time.
+        moved: [C] their positions [B, L, N, 3] in the recording's frame at the time of each clock.
+        clouds: [C][L] recorded points of each clock.
+        nodes: number of nodes per clock; the node indices of later clocks are offset by multiples of it.
+        cut: surface points below this height are excluded, because the recording was cropped there.
+        share: sum of the weights over all frames.
+        seen: bool [B, L, N] visible points; None for all.
+        guesses: [B, L, N, C] indices of points that are probably near; they only save time.
+
+    Returns:
+        The pairs, and the indices [B, L, N, C] of the nearest recorded points of each clock.
     """
     every, frames = [], len(clouds[0])
     here, nearest = moved[0], None
@@ -325,13 +335,17 @@ def pairs_back(
     share: float,
     guesses: Tensor | None = None,
 ) -> tuple[Pairs, Tensor]:
-    """Each recorded point with the nearest place on the surface, and the numbers of the faces there [B, L, Q].
+    """Pair each recorded point with the nearest point of the surface.
 
     Args:
-        views: [C] nodes of the surface when each clock looks [B, L, V, 3].
-        faces: [F, 3] of the cloth, and of bodies beside it.
-        pose: [B, d]
-        guesses: [B, L, Q] faces that may be near; they save time.
+        views: [C] surface nodes [B, L, V, 3] at the time of each clock.
+        recorded: the recorded points.
+        pose: [B, d] poses.
+        share: sum of the weights over all frames.
+        guesses: [B, L, Q] indices of faces that are probably near; they only save time.
+
+    Returns:
+        The pairs, and the face indices [B, L, Q].
     """
     points, sure, counts = recorded.points, recorded.sure, recorded.counts
     queries = space.back(points, pose).split(counts, dim=2)
@@ -350,13 +364,14 @@ def pairs_back(
 def nearest_places(
     positions: Tensor, faces: Tensor, queries: Tensor, guesses: Tensor | None = None
 ) -> tuple[SurfacePoints, Tensor]:
-    """The places on faces [F, 3] of meshes at node positions [B, L, V, 3] nearest to queries [B, L, Q, 3], and the numbers
-    of their faces [B, L, Q].
-
-    Where a position is no number, the place is the first corner.
+    """Return the surface points nearest to queries [B, L, Q, 3], and their face indices [B, L, Q]. If a node position
+    is NaN, the result is the first corner of a face.
 
     Args:
-        guesses: [B, L, Q] faces that may be near; they save time.
+        positions: [B, L, V, 3] nodes of the mesh.
+        faces: [F, 3] faces.
+        queries: [B, L, Q, 3] query points.
+        guesses: [B, L, Q] indices of faces that are probably near; they only save time.
     """
     from diffcloud.clouds.surface import NO_GUESS, find_on_surface  # numba takes a moment to import
 

@@ -1,7 +1,7 @@
-"""What variables are called in a fit of several recordings.
+"""Names of the variables in a fit of several recordings.
 
-Material and size belong to the cloth, so all recordings share them. Turn, shape and track are each recording's own: in a
-joint fit, `turn@0` is the turn in the first recording; in the fit of a single one, it is plain `turn`.
+Material and size belong to the cloth, so all recordings share them. `turn`, `shape` and `track` are separate for each
+recording. In a joint fit, `turn@0` is the turn of the first recording; a fit of one recording has plain `turn`.
 """
 
 from __future__ import annotations
@@ -10,28 +10,28 @@ from collections.abc import Mapping, Sequence
 from typing import TypeVar
 
 SHARED = ("size",)
-"""Of how the cloth lies (`estimation.initial_state`), what is the same in all recordings."""
+"""Initial-state variables (`estimation.initial_state`) that all recordings share."""
 _OWN = "@"
 T = TypeVar("T")
 
 
 def plain_name(name: str) -> str:
-    """Without the number of its recording."""
+    """Return the name without its recording number."""
     return name.partition(_OWN)[0]
 
 
 def of_recording(named: Mapping[str, T], recording: int) -> dict[str, T]:
-    """What holds for one recording: what all share, and what is its own, under plain names.
+    """Select the shared entries and those of one recording, under plain names.
 
     Args:
-        recording: its number, from 0.
+        recording: number of the recording, from 0.
     """
     here = {name: name.partition(_OWN)[2] in ("", str(recording)) for name in named}
     return {plain_name(name): value for name, value in named.items() if here[name]}
 
 
 def without_recording(named: Mapping[str, T], recording: int) -> dict[str, T]:
-    """All but what is one recording's own; recordings after it are renumbered, each number lower by one."""
+    """Remove the entries of one recording. The numbers of later recordings decrease by one."""
     found = dict[str, T]()
     for name, value in named.items():
         plain, own, number = name.partition(_OWN)
@@ -43,8 +43,7 @@ def without_recording(named: Mapping[str, T], recording: int) -> dict[str, T]:
 
 
 def of_all(each: Sequence[Mapping[str, T]]) -> dict[str, T]:
-    """Puts together what is told of how the cloth lies in each recording, under the names of a joint fit; `of_recording`
-    takes it apart again."""
+    """Merge the entries of all recordings under the names of a joint fit; the inverse of `of_recording`."""
     found = dict[str, T]()
     for number, own in enumerate(each):
         for name, value in own.items():

@@ -1,9 +1,9 @@
-"""The loss of parameter sets on a recording: simulate, lay the scene as it lies, sample, compare with its clouds.
+"""Loss of parameter sets on one recording: simulate, apply the pose, sample the surface, compare with the clouds.
 
-There are two measures. The default one compares every usable frame in both directions, each distance capped, counts
-simulated points only where the recording could have some, and takes the lowest loss over the pose of the scene
-(`estimation.pose`), so that solvers see parameters alone. The paper's is one-sided and squared, at the loss frames, and
-knows no pose.
+There are two losses. The default loss compares all usable frames in both directions with capped distances. It omits
+simulated points that the cameras could not see, and it is minimised over the pose of the scene (`estimation.pose`), so
+solvers see material parameters only. The loss of the paper is one-sided, squared, evaluated at the loss frames, and has
+no pose.
 """
 
 from __future__ import annotations
@@ -30,17 +30,18 @@ from diffcloud.scene.scenarios import Scenario
 from diffcloud.sim.simulate import Rollout
 
 CAP_M = 0.05
-"""A larger distance counts as this one."""
+"""Distances are capped at this value [m], so outliers do not pull on the cloth."""
 _CHUNK = 20
-"""Parameter sets whose motions, derivatives and sampled clouds are in memory at the same time."""
+"""Number of parameter sets that are simulated at once. It bounds the memory for motions and derivatives."""
 _FEWEST = 200
-"""Points of a frame, however many frames share the scenario's."""
+"""Minimum number of sampled points per frame."""
 _NEAR_M = 0.008
-"""A layer of cloth that lies so close over another does not hide it: a camera sees both as one."""
+"""A cloth layer closer than this [m] does not occlude a point, since a camera cannot separate the two layers."""
 _FEW = 5
-"""Frames by which a pose is found before all have their say."""
+"""Number of frames for the coarse pose search, before all frames are used."""
 _FIRST_CAPS = (np.inf, np.inf, 4.0, 4.0, 2.0, 2.0, *[1.0] * 10)
-"""Factors of the cap in the steps from no pose at all: a cloth that lies elsewhere is far from all that was recorded."""
+"""Factors of the distance cap in each step from the zero pose. The first are large, because the cloth may be far from
+the recorded points."""
 _CAPS = (2.0, *[1.0] * 8)
 _LAST_CAPS = (1.0, 1.0)
 
@@ -59,20 +60,22 @@ class Objective:
         points: int | None = None,
         seed: int = 0,
     ) -> None:
-        """
+        """Read the episode and choose the compared frames and sample points.
+
         Args:
-            paper: the published measure.
-            nuisance: free variables of the pose, with the standard deviations of their priors [m, rad, s]; by default
-                the episode's `default_priors`, in the paper's measure none. `lag` is that of every camera's clock.
-            frames: to compare; negative ones count from the end. By default every usable one, unless the scenario names
-                some.
-            points: sampled per frame; by default the scenario's, which all frames share in the default measure.
-            seed: of the common random numbers.
+            paper: use the loss of the paper.
+            nuisance: free pose variables -> standard deviation of the prior [m, rad, s]. `lag` applies to every
+                camera's clock. Default: the episode's `default_priors`, or none with the loss of the paper.
+            frames: frames to compare; negative numbers count from the end. Default: the scenario's, or all usable
+                frames.
+            points: number of sampled points per frame. Default: the scenario's, which in the default loss is divided
+                among the frames.
+            seed: seed of the sampled points, which all evaluations share.
 
         Raises:
-            EpisodeError: a loss frame that an episode lacks, one after the end of the simulation, none that is usable, or
-                a damaged meta.
-            ConfigError: an unknown variable of the pose, or any in the paper's measure.
+            EpisodeError: a loss frame is missing or after the end of the simulation, no frame is usable, or meta is
+                damaged.
+            ConfigError: a pose variable is unknown, or the loss of the paper is requested with pose variables.
         """
         self.scenario, self.episode, self.paper = scenario, episode, paper
         self.system, _ = scenario.scene.build()
@@ -103,7 +106,7 @@ class Objective:
 
     @property
     def members(self) -> tuple[Objective, ...]:
-        """This one alone; of a `JointObjective` one for each recording."""
+        """Objectives of the single recordings: here only this one, in a `JointObjective` one per recording."""
         return (self,)
 
     @property
@@ -112,7 +115,7 @@ class Objective:
 
     @property
     def point_count(self) -> int:
-        """Sampled per frame."""
+        """Number of points sampled per frame."""
         if self.asked_points is not None:
             return self.asked_points
         share = 1 if self.paper else len(self._target.frames)
@@ -120,12 +123,12 @@ class Objective:
 
     @property
     def frames(self) -> tuple[int, ...]:
-        """The compared frames of an episode, from 0."""
+        """Numbers of the compared frames in the episode, from 0."""
         return self._target.frames
 
     @property
     def cut(self) -> float | None:
-        """Height below which nothing was recorded; simulated points do not count there."""
+        """Crop height of the recording in scene units, or None. Simulated points below it are omitted."""
         return self._target.cut
 
     @property
@@ -134,22 +137,22 @@ class Objective:
 
     @property
     def times(self) -> Tensor:
-        """[L] of the compared frames [s]."""
+        """[L] times of the compared frames [s]."""
         return self._target.times
 
     @property
     def track(self) -> Tensor | None:
-        """[1, S, G, 3] displacement of the grippers up to the last compared frame [m]; None: the scene's own motion."""
+        """[1, S, G, 3] gripper displacements up to the last compared frame. None: the scene's own motion."""
         track = self._target.track
         return None if track is None else track[:, : self.loss_steps]
 
     @property
     def clouds(self) -> tuple[NeighbourIndex, ...]:
-        """The recorded clouds of the L compared frames."""
+        """Recorded clouds of the L compared frames."""
         return self._target.clouds
 
     def of(self, scenario: Scenario) -> Objective:
-        """The same recording compared with another scenario of it."""
+        """Return the objective of the same recording for another variant of its scenario."""
         found = self._anew(scenario, self.frames)
         found.asked_frames = self.asked_frames
         return found
@@ -166,7 +169,7 @@ class Objective:
         )
 
     def reseed(self, seed: int) -> None:
-        """Draw the common random numbers anew."""
+        """Sample new points on the cloth and in the clouds."""
         self._seed = seed
         generator = torch.Generator().manual_seed(seed)
         cloth = torch.as_tensor(self.system.mesh.faces)
@@ -183,18 +186,19 @@ class Objective:
         self._recorded = self._drawn(generator)
 
     def __call__(self, parameters: Mapping[str, Tensor]) -> Tensor:
-        """Losses [B] in squared length units of the scene, with the prior of the pose. Differentiable, with the pose held
-        fixed: it is where this loss is lowest.
+        """Return losses [B] in squared length units of the scene, including the pose prior.
+
+        The losses are differentiable. The pose is held fixed, because the loss is already minimal over it.
 
         Args:
             parameters: name -> [B].
 
         Raises:
-            DivergedError: names step and batch entries.
+            DivergedError: a simulation diverged; names the step and the batch entries.
         """
         batch = len(next(iter(parameters.values()))) if parameters else 1
         losses = []
-        for begin in range(0, batch, _CHUNK):  # nothing inside loops over the batch
+        for begin in range(0, batch, _CHUNK):  # each chunk is simulated as one batch
             part = {name: value[begin : begin + _CHUNK] for name, value in parameters.items()}
             try:
                 motion = self.match(self.simulate_to_loss(part))
@@ -205,70 +209,75 @@ class Objective:
         return torch.cat(losses)
 
     def simulate_to_loss(self, parameters: Mapping[str, Tensor]) -> Rollout:
-        """The rollout up to the last compared frame."""
+        """Simulate up to the last compared frame."""
         return self.simulate(parameters, steps=self.loss_steps)
 
     def simulate(self, parameters: Mapping[str, Tensor], *, steps: int | None = None) -> Rollout:
-        """The rollout of parameter sets with an episode's gripper track, by default over the whole scenario."""
+        """Simulate parameter sets with the episode's gripper track; by default for all steps of the scenario."""
         return self.inputs(parameters, self.scenario.steps if steps is None else steps).rollout()
 
     def inputs(self, parameters: Mapping[str, Tensor], steps: int) -> Inputs:
-        """Of parameter sets, with an episode's gripper track."""
+        """Return the simulator inputs of parameter sets, with the episode's gripper track."""
         return Inputs.of(self.scenario, self.system, steps, parameters, self._target.track)
 
     def frame_losses(self, run: Rollout, *, pose: Tensor | None = None) -> Tensor:
-        """[B, L] losses of a rollout at each compared frame, at its pose or at poses [B, d]."""
+        """Return losses [B, L] of a rollout at each compared frame, at its best pose or at the given poses [B, d]."""
         return self.losses(self.match(run, pose=pose))
 
     def losses(self, motion: Motion) -> Tensor:
-        """[B, L] losses of a matched motion at each compared frame."""
+        """Return losses [B, L] of a matched motion at each compared frame."""
         found = [pairs.losses(self._moved(motion, pairs), self.cap) for pairs in motion.pairs]
         return len(self.frames) * torch.stack(found).sum(0)
 
     def squares(self, motion: Motion) -> Tensor:
-        """[B, L] mean squared distances of a matched motion at each compared frame, in squared length units."""
+        """Return mean squared distances [B, L] of a matched motion at each compared frame, in squared length units."""
         found = [pairs.squares(self._moved(motion, pairs), self.cap) for pairs in motion.pairs]
         return len(self.frames) * torch.stack(found).sum(0)
 
     def way_squares(self, motion: Motion) -> list[float]:
-        """Return the capped mean squared distances of one matched motion over all frames, in squared length units. The
-        first is from simulated to recorded points; the default measure adds one from recorded points to the cloth."""
+        """Return the capped mean squared distance of each direction for one matched motion, in squared length units.
+        The first value is from simulated to recorded points. The default loss adds the value from recorded points to
+        the cloth."""
         return [float(pairs.squares(self._moved(motion, pairs), self.cap).mean() / pairs.share) for pairs in motion.pairs]
 
     def points(self, run: Rollout, *, pose: Tensor | None = None) -> Tensor:
-        """[B, L, N, 3] points sampled on a rollout's cloth at the compared frames, in the recording's frame."""
+        """Return points [B, L, N, 3] sampled on a rollout's cloth at the compared frames, in the recording's frame."""
         motion = self.match(run, pose=pose)
         return self._moved(motion, motion.pairs[0])
 
     def pose(self, run: Rollout) -> Tensor:
-        """[B, d] the pose of a rollout. It belongs to the motion: where points are drawn anew, it may stay."""
+        """Return the best poses [B, d] of a rollout. They remain valid if the sample points are resampled."""
         return self.match(run).pose
 
     def posed_nodes(self, run: Rollout, pose: Tensor, *, steps: bool = False) -> NDArray[np.float64]:
-        """[T + 1, V, 3] the cloth's nodes of a rollout of one motion at every frame of the scenario, or at every step, in
-        the recording's frame."""
+        """Return the cloth nodes [T + 1, V, 3] of a rollout of one motion in the recording's frame.
+
+        Args:
+            steps: return every simulation step instead of every frame of the scenario.
+        """
         times = run.times[:: 1 if steps else self.scenario.scene.frame_steps]
         return self._target.space.moved_motion(run.at, times, pose).numpy()
 
     def posed_bodies(self, pose: Tensor) -> NDArray[np.float64]:
-        """[V, 3] the nodes of the bodies beside the cloth, in the recording's frame."""
+        """Return the nodes [V, 3] of the other bodies in the recording's frame."""
         return self._target.space.moved(self._bodies[None], pose)[0].numpy()
 
     def match(self, run: Rollout, *, pose: Tensor | None = None) -> Motion:
-        """Match a rollout to the recording, at its pose of lowest loss or at poses [B, d]."""
+        """Match a rollout to the recording at its pose of lowest loss, or at poses [B, d]."""
         velocities = self.still_bodies(self.velocities(run)) if self.pose_space.moves_clocks else None
         return self.matched(self.with_bodies(self.looked_at(run)), velocities, pose)
 
     def looked_at(self, run: Rollout) -> Tensor:
-        """[B, L, C · V', 3] a rollout's nodes at the compared frames, at the offset of each of the C clocks: those of one
-        clock after those of another."""
+        """Return a rollout's nodes [B, L, C · V', 3] at the compared frames, at the offset of each of the C clocks. The
+        nodes of one clock follow those of the previous clock."""
         return torch.cat([run.at(self.times + offset) for offset in self.pose_space.clocks.values()], dim=-2)
 
     def way_to(self, variant: Scenario, parameters: Mapping[str, Tensor], nodes: Tensor) -> Tensor:
-        """[B, L, C · V, 3] from nodes of the cloth, as `looked_at` has them, to where a variant of the scenario has them.
+        """Return displacements [B, L, C · V, 3] from the given nodes to the nodes of a scenario variant.
 
         Args:
-            variant: with other steps, or with a mesh whose first nodes are those of the scenario's.
+            variant: scenario with another time step, or with a mesh whose first nodes are those of this scenario.
+            nodes: cloth nodes in the layout of `looked_at`.
 
         Raises:
             DivergedError: the variant's motion diverges.
@@ -283,8 +292,8 @@ class Objective:
         return there.unflatten(-2, (clocks, -1))[..., : nodes.shape[-2] // clocks, :].flatten(-3, -2) - nodes
 
     def velocities(self, run: Rollout) -> Tensor:
-        """[B, L, C · V', 3] velocities of the nodes that `looked_at` returns, by central differences over one step to
-        each side. Velocities before the start of the motion are zero."""
+        """Return velocities [B, L, C · V', 3] of the nodes that `looked_at` returns. They are central differences over
+        one step to each side. Velocities before the start of the motion are zero."""
         step, last, found = float(run.times[1]), float(run.times[-1]), []
         for offset in self.pose_space.clocks.values():
             before, after = ((self.times + offset + way * step).clamp(0.0, last) for way in (-1, 1))
@@ -292,8 +301,8 @@ class Objective:
         return torch.cat(found, dim=-2)
 
     def matched(self, nodes: Tensor, velocities: Tensor | None, pose: Tensor | None) -> Motion:
-        """Match nodes and their velocities [B, L, C · V, 3] at the compared frames to the recording, as `match` does. They
-        include the nodes of bodies."""
+        """Match nodes [B, L, C · V, 3] and their velocities to the recording, as `match` does. The nodes are at the
+        compared frames and include those of the other bodies."""
         with torch.no_grad():
             still = nodes.detach(), None if velocities is None else velocities.detach()
             if pose is None and self.pose_space.names:
@@ -304,8 +313,9 @@ class Objective:
             return replace(matcher(pose), nodes=nodes, velocities=velocities)
 
     def _lowest(self, nodes: Tensor, velocities: Tensor | None) -> tuple[Tensor, Matcher]:
-        """As of `_follow`, from the pose of the nominal material. With a scale, poses have several minima: then the lower
-        one of two, reached from the nominal material's scale and from none."""
+        """Return the best poses [B, d] and their matcher, starting from the pose of the nominal material. With a free
+        scale the loss has several minima in the pose. Then a second search starts at scale 0, and the lower minimum is
+        used."""
         space, first = self.pose_space, self._first_pose().expand(len(nodes), -1)
         pose, matcher = self._follow(nodes, velocities, first, _CAPS)
         if "scale" in space.names:
@@ -318,14 +328,14 @@ class Objective:
         return pose, matcher
 
     def _first_pose(self) -> Tensor:
-        """[1, d] of the nominal material, from zero on."""
+        """Return the best pose [1, d] of the nominal material, searched from the zero pose. The result is cached."""
         if self._first is None:
             self._first = torch.zeros(1, len(self.pose_space.names), dtype=torch.float64)
-            with suppress(DivergedError):  # then steps begin at zero, whatever the parameters
+            with suppress(DivergedError):  # without a nominal motion, all searches start at the zero pose
                 run = self.simulate_to_loss({})
                 nodes = self.with_bodies(self.looked_at(run))
                 self._first, _ = self._follow(nodes, torch.zeros_like(nodes), self._first, _FIRST_CAPS)
-                if len(self.pose_space.clocks) > 1 and self.pose_space.moves_clocks:  # may be far off their offsets
+                if len(self.pose_space.clocks) > 1 and self.pose_space.moves_clocks:  # clocks may be far off
                     velocities = self.still_bodies(self.velocities(run))
                     self._first, _ = self._follow(nodes, velocities, self._first, _CAPS)
         return self._first
@@ -333,8 +343,8 @@ class Objective:
     def _follow(
         self, nodes: Tensor, velocities: Tensor | None, start: Tensor, caps: Sequence[float]
     ) -> tuple[Tensor, Matcher]:
-        """[B, d] poses of lowest loss of nodes [B, L, C · V, 3], from a start on, on a few frames and then on all; and what
-        matches all of them there."""
+        """Return the poses [B, d] of lowest loss that a search from `start` finds, and a matcher of all frames. The
+        search uses a few frames first and then all."""
         space, every = self.pose_space, range(nodes.shape[1])
         few = np.unique(np.linspace(0, len(every) - 1, _FEW).round().astype(int)).tolist()
         pose = start
@@ -351,7 +361,7 @@ class Objective:
         return pose, matcher
 
     def _matcher(self, nodes: Tensor, velocities: Tensor | None, frames: Sequence[int]) -> Matcher:
-        """Of motions [B, L, C · V, 3] at some of the compared frames."""
+        """Return a matcher of motions [B, L, C · V, 3] for a subset of the compared frames."""
         chosen, clocks = list(frames), len(self.pose_space.clocks)
         still, moving = nodes[:, chosen], None if velocities is None else velocities[:, chosen]
         return Matcher(
@@ -365,18 +375,21 @@ class Objective:
         )
 
     def terms(self, motion: Motion, *, factor: float = 1.0) -> tuple[Tensor, Tensor, Tensor]:
-        """Loss [B], half of its slope [B, d] and curvature [B, d, d] by the pose, without its prior.
+        """Return the loss [B], half its gradient [B, d] and half its Hessian approximation [B, d, d] in the pose,
+        without prior.
 
         Args:
-            factor: of the cap.
+            factor: factor of the distance cap.
         """
         return motion.terms(self.pose_space, self.cap * factor)
 
     def columns(self, motion: Motion, rates: Tensor) -> tuple[list[Tensor], list[Tensor]]:
-        """For each kind of pairs, where its places lie in the recording [B, L, N, 3], and their rates [k + d, B, L, N, 3].
+        """Return the surface points [B, L, N, 3] of each kind of pair in the recording's frame, and their derivatives.
+
+        The derivatives [k + d, B, L, N, 3] are with respect to the k variables and the d pose variables.
 
         Args:
-            rates: [k, B, L, C · V', 3] of the cloth's nodes by k variables.
+            rates: derivatives [k, B, L, C · V', 3] of the cloth nodes with respect to the k variables.
         """
         space = self._target.space
         here = motion.shown(space)
@@ -392,21 +405,21 @@ class Objective:
         return moved, every
 
     def earliest(self, counts: Sequence[int]) -> Objective:
-        """The same on its earliest compared frames.
+        """Return the same objective restricted to its earliest compared frames.
 
         Args:
-            counts: one number, of these; a `JointObjective` takes one for each recording.
+            counts: a single number of frames. A `JointObjective` takes one number per recording.
         """
         (count,) = counts
         chosen = sorted(self.times.argsort(stable=True)[:count].tolist())
         return self._anew(self.scenario, [self.frames[each] for each in chosen])
 
     def with_bodies(self, positions: Tensor) -> Tensor:
-        """[..., C · V', 3] nodes of the cloth -> with those of the bodies beside it, in the default measure."""
+        """Append the nodes of the other bodies to cloth nodes [..., C · V', 3]; the loss of the paper has none."""
         return self._beside(positions, self._bodies)
 
     def still_bodies(self, rates: Tensor) -> Tensor:
-        """[..., C · V', 3] derivatives of the cloth's nodes -> with those of the bodies, which stand still."""
+        """Append zeros for the other bodies to derivatives [..., C · V', 3] of the cloth nodes."""
         return self._beside(rates, torch.zeros_like(self._bodies))
 
     def _beside(self, cloth: Tensor, bodies: Tensor) -> Tensor:
@@ -422,7 +435,7 @@ class Objective:
     def _steps_to_loss(self) -> int:
         space = self._target.space
         last = float(self._target.times.max()) + max(space.clocks.values())
-        steps = int(np.ceil(last / self.system.time_step - 1e-6)) + space.moves_clocks  # a velocity has two sides
+        steps = int(np.ceil(last / self.system.time_step - 1e-6)) + space.moves_clocks  # central differences need one more
         return min(max(steps, 1), self.scenario.steps)
 
     def _moved(self, motion: Motion, pairs: Pairs) -> Tensor:
@@ -430,8 +443,9 @@ class Objective:
         return space.moved(pairs.places.of(motion.shown(space)), motion.pose)
 
     def _drawn(self, generator: torch.Generator) -> Recorded:
-        """Recorded points that look for the cloth, as many as there are sampled ones, at least one of each clock: in every
-        frame the same number of a clock, which count as much as their share of the frame's points."""
+        """Sample the recorded points that are compared with the cloth, about as many as simulated points. Each clock
+        has the same number of points in every frame, at least one. Their weights correct for the clock's share of the
+        frame's points."""
         target = self._target
         every = np.array([[len(of) if of.any() else 0 for of in sure] for sure in target.sure])  # [C, L]
         counts = np.maximum(np.floor(self.point_count * every.sum(1) / every.sum()).astype(int), 1)
@@ -440,7 +454,7 @@ class Objective:
         points, sure = [], []
         for frame, whole in enumerate(target.clouds):
             for clock, count in enumerate(counts):
-                cloud = target.views[clock][frame] if every[clock, frame] else whole  # whose points do not count here
+                cloud = target.views[clock][frame] if every[clock, frame] else whole  # these points get zero weight
                 index = torch.randint(len(cloud.points), (int(count),), generator=generator)
                 points.append(cloud.points[index])
                 weights = target.sure[clock][frame] if every[clock, frame] else torch.zeros(len(whole.points)).double()

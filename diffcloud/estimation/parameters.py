@@ -1,10 +1,10 @@
-"""What is fitted: bounded variables behind a sigmoid (paper, section III-C).
+"""Fitted variables with bounds, mapped to unbounded ones by a sigmoid (paper, section III-C).
 
     linear (the paper):  w = lo + (hi - lo) σ(s)
     logarithmic:         w = lo (hi / lo)^σ(s)
 
-On the published clouds the better minima often lie at multipliers of 0.1 to 0.5, which a start at the middle of the linear
-scale hardly reaches; extra starts therefore use the logarithmic scale where the lower bound is positive.
+On the published clouds the better minima often have multipliers of 0.1 to 0.5. A start at the centre of the linear
+range rarely reaches them. Additional starts therefore use the logarithmic scale if the lower bound is positive.
 """
 
 from __future__ import annotations
@@ -29,24 +29,24 @@ _EDGE = 1e-6
 
 
 Role = Literal["requested", "material", "initial_state"]
-"""Of a variable; the last two are of `estimation.uncertain` and `estimation.initial_state`."""
+"""Role of a variable. See `estimation.uncertain` for `material` and `estimation.initial_state` for `initial_state`."""
 
 
 @dataclass(frozen=True)
 class Variable:
-    """One fitted number."""
+    """One fitted scalar variable with its bounds and prior."""
 
     name: str
     low: float
     high: float
     prior: float | None = None
-    """Factor of one deviation of its log-normal prior; None: none."""
+    """Standard deviation of the log-normal prior, as a factor. None: no such prior."""
     centre: float = 1.0
-    """Of the prior; by default the nominal material."""
+    """Centre of the prior; by default the nominal material."""
     role: Role = "requested"
-    """`material` and `initial_state` are nuisance variables: fitted because they are not known exactly, and no results."""
+    """`material` and `initial_state` are nuisance variables: fitted because they are uncertain, but not reported."""
     deviation: float | None = None
-    """One standard deviation of a normal prior about zero, instead of the log-normal one, of what may be negative."""
+    """Standard deviation of a normal prior about zero, for variables that may be negative. None: no such prior."""
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.low) and math.isfinite(self.high) and self.low < self.high):
@@ -60,8 +60,8 @@ class Variable:
         return self.role != "requested"
 
     def spread(self, parts: NDArray[np.float64]) -> NDArray[np.float64]:
-        """[n] values that parts [n] of 1, evenly spread, stand for: as the prior of uncertain material has them, of another
-        variable log-uniform over its range, or uniform where that begins at zero."""
+        """Map fractions [n] in [0, 1] to values [n] by the inverse distribution function. Uncertain material follows
+        its prior. Other variables are log-uniform over their range, or uniform if the lower bound is zero."""
         if self.role == "material" and self.prior is not None:
             from scipy.special import ndtri  # slow to import, and needed by few
 
@@ -73,7 +73,7 @@ class Variable:
 
 @dataclass(frozen=True)
 class FitSpace:
-    """The fitted variables, and parameters known beforehand."""
+    """The fitted variables and the fixed parameters."""
 
     variables: tuple[Variable, ...]
     fixed: Mapping[str, float]
@@ -86,15 +86,16 @@ class FitSpace:
         fixed: Mapping[str, float] | None = None,
         priors: Mapping[str, float] | None = None,
     ) -> FitSpace:
-        """
+        """Build a space from parameter names.
+
         Args:
             names: parameters to fit.
             bounds: overrides of each parameter's own bounds.
-            fixed: parameters with a known value (a weighed cloth: mass).
-            priors: factors of one deviation (`estimation.priors`); none where not given.
+            fixed: parameters with a known value, such as the density of a weighed cloth.
+            priors: standard deviations as factors (`estimation.priors`); parameters that are not named have no prior.
 
         Raises:
-            ConfigError: an unknown, repeated or doubly given parameter, or bounds out of order.
+            ConfigError: a parameter is unknown or repeated, all parameters are fixed, or bounds are out of order.
         """
         fixed, bounds = dict(fixed or {}), dict(bounds or {})
         for name in (*names, *bounds):
@@ -119,30 +120,31 @@ class FitSpace:
 
     @property
     def asked(self) -> FitSpace:
-        """The requested variables; nuisance variables are at the centres of their priors."""
+        """The space of the requested variables. Nuisance variables are fixed at the centres of their priors."""
         known = {variable.name: variable.centre for variable in self.variables if variable.nuisance}
         return FitSpace(tuple(v for v in self.variables if not v.nuisance), {**self.fixed, **known})
 
     def of_recording(self, recording: int) -> tuple[FitSpace, Tensor]:
-        """Of one recording of a joint fit (`estimation.names`), and where its k variables are among all."""
+        """Return the space of one recording of a joint fit (`estimation.names`), and the indices of its k variables."""
         chosen = of_recording(dict(zip(self.names, range(len(self.names)), strict=True)), recording)
         variables = tuple(replace(self.variables[place], name=name) for name, place in chosen.items())
         return FitSpace(variables, of_recording(self.fixed, recording)), torch.tensor([*chosen.values()])
 
     def without_recording(self, recording: int) -> FitSpace:
-        """Of the others of a joint fit."""
+        """Return the space of a joint fit without one recording."""
         left = without_recording(dict(zip(self.names, self.variables, strict=True)), recording)
         variables = tuple(replace(variable, name=name) for name, variable in left.items())
         return FitSpace(variables, without_recording(self.fixed, recording))
 
     def check_start(self, first: Mapping[str, float], nominal: Callable[[str], float] = lambda name: 1.0) -> None:
-        """
+        """Check the values of the first start.
+
         Args:
-            first: values of a first start.
-            nominal: parameter -> value that a multiplier of 1 stands for, for messages.
+            first: name -> value.
+            nominal: function from a parameter to the value of multiplier 1, used in messages.
 
         Raises:
-            ConfigError: one of what is not fitted, or outside of its bounds; names the nearest that is allowed.
+            ConfigError: a value is outside its bounds, or its variable is not fitted. Names the nearest allowed value.
         """
         bounds = {variable.name: (variable.low, variable.high) for variable in self.asked.variables}
         for name, value in first.items():
@@ -158,11 +160,11 @@ class FitSpace:
                 )
 
     def nearest(self, first: Mapping[str, float]) -> dict[str, float]:
-        """Of values that a prediction gave, those that are fitted, within their bounds."""
+        """Return the fitted variables among predicted values, clipped to their bounds."""
         return {v.name: min(max(first[v.name], v.low), v.high) for v in self.variables if v.name in first}
 
     def values(self, unbounded: Tensor, logarithmic: Tensor) -> Tensor:
-        """[B, k] unbounded variables -> [B, k] values; `logarithmic` bool [B] picks the scale of each start."""
+        """Map unbounded variables [B, k] to values [B, k]. `logarithmic`, bool [B], chooses the scale of each start."""
         low, high = self._bounds(unbounded)
         fraction = torch.sigmoid(unbounded)
         safe = torch.where(low > 0, low, 1.0)
@@ -170,7 +172,7 @@ class FitSpace:
         return torch.where(logarithmic[:, None] & (low > 0), safe * ratio**fraction, low + (high - low) * fraction)
 
     def unbounded(self, values: Tensor, logarithmic: Tensor) -> Tensor:
-        """The inverse of `values`; values on or beyond a bound are brought just inside."""
+        """Return the inverse of `values`. Values on or beyond a bound are moved just inside."""
         low, high = self._bounds(values)
         linear = (values - low) / (high - low)
         safe = torch.where(low > 0, low, 1.0)
@@ -179,11 +181,11 @@ class FitSpace:
         return torch.logit(fraction.clamp(_EDGE, 1 - _EDGE))
 
     def starts(self, count: int, *, seed: int, first: Mapping[str, float] | None = None) -> tuple[Tensor, Tensor]:
-        """Initial values [count, k] and which scale each start uses, bool [count].
+        """Return initial values [count, k] and whether each start uses the logarithmic scale, bool [count].
 
-        The first start is the middle of the range on the paper's linear scale, for nuisance variables the centre of the
-        prior, or `first` where given. The others are spread by a scrambled Sobol sequence: over the box log-uniformly,
-        uncertain material as its prior says. How a cloth lies begins as in the first one.
+        The first start is `first` where given. Otherwise it is the centre of the linear range, or of the prior for
+        nuisance variables. The other starts come from a scrambled Sobol sequence: log-uniform over the box, or by the
+        prior for uncertain material. Initial-state variables are the same in all starts.
         """
         values = np.empty((count, len(self.variables)))
         for column, variable in zip(values.T, self.variables, strict=True):
@@ -197,33 +199,34 @@ class FitSpace:
         return torch.as_tensor(values), torch.arange(count) > 0
 
     def parameters(self, values: Tensor) -> dict[str, Tensor]:
-        """[B, k] -> parameters of the simulator, the fixed ones too, name -> [B]."""
+        """Map values [B, k] to parameters of the simulator, including the fixed ones: name -> [B]."""
         columns = dict(zip(self.names, values.unbind(-1), strict=True))
         return columns | {name: torch.full_like(values[:, 0], value) for name, value in self.fixed.items()}
 
     def prior_weights(self, recordings: int) -> Tensor:
-        """[k] what the logarithm of the loss gains by the square of each variable's `off_centre` (`estimation.priors`).
+        """Return weights [k] of the squared `off_centre` values in the logarithm of the loss (`estimation.priors`).
 
         Args:
-            recordings: over which the loss is a mean; they say the more, the more there are.
+            recordings: number of recordings over which the loss is averaged. Priors weigh less if there are more.
         """
         count = INDEPENDENT * recordings
         steps = self.prior_steps()
         return torch.where(steps > 0, 1 / (count * steps.square()), 0.0)
 
     def prior_steps(self) -> Tensor:
-        """[k] one standard deviation of each prior, as `off_centre` measures; zero where there is none."""
+        """Return the standard deviation of each prior [k] in the units of `off_centre`; zero without a prior."""
         logs = [0.0 if v.prior is None else math.log(v.prior) for v in self.variables]
         steps = [log if v.deviation is None else 1.0 for log, v in zip(logs, self.variables, strict=True)]
         return torch.tensor(steps, dtype=torch.float64)
 
     def prior_factor(self, values: Tensor, recordings: int) -> Tensor:
-        """[B] by which the priors multiply the loss of values [B, k]."""
+        """Return factors [B] by which the priors multiply the loss of values [B, k]."""
         return (self.prior_weights(recordings) * self.off_centre(values).square()).sum(-1).exp()
 
     def off_centre(self, values: Tensor) -> Tensor:
-        """[..., k] logarithms of values over the centres of their priors, of normal ones the values in deviations; zero for
-        those without one."""
+        """Return the deviations [..., k] of values from the centres of their priors. For log-normal priors this is the
+        logarithm of the ratio, for normal priors the number of standard deviations. Variables without a prior give
+        zero."""
         normal = torch.tensor([variable.deviation is not None for variable in self.variables])
         scales = values.new_tensor([v.centre if v.deviation is None else v.deviation for v in self.variables])
         known = torch.tensor([variable.prior is not None for variable in self.variables])

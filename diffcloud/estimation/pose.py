@@ -1,20 +1,22 @@
-"""How a recording lies against the scene: fitted with the parameters, for each episode, and no property of the cloth.
+"""Pose of a recording relative to the scene. It is fitted for each episode, and is no property of the cloth.
 
-The scene is turned about the recording's centre c by the rotation vector w = (tilt_x, tilt_y, yaw), shifted by
-t = (x, y, z), shown e^scale times as large, and looked at later by `lag`:
+The pose rotates the scene about the recording's centre c by the rotation vector w = (tilt_x, tilt_y, yaw). It shifts
+the scene by t = (x, y, z) and scales it by e^scale. Times are later by `lag`:
 
     x' = e^scale exp([w]×) (x(time + lag) - c) + c + t
 
-On a level table, x and y, and yaw of cloth, gripper and bodies together, are symmetries of the motion: they need no new
-simulation. A cloth that lies turned under a gripper which does not turn is another motion; yaw only approximates it. z and
-the tilts are those of the cameras against the robot, which a calibration knows to millimetres. `scale` is that of the
-cameras' depths. One camera whose depths are 3 % too large shows everything 3 % larger, about itself; but where cameras were
-registered by such depths, their clouds fit together, and are in place, where the board was. So the scale is about c, and
-shifts are what is left. A cloud stamped t shows the motion at t + lag.
+On a level table, the motion does not change under x and y shifts, or under a common yaw of cloth, gripper and bodies.
+So these variables need no further simulation. If only the cloth is rotated, and not the gripper's path, the motion is
+different and yaw is an approximation. z and the tilts describe the extrinsics of the cameras relative to the robot,
+which a calibration knows to millimetres.
 
-Where the recording knows its `clocks`, each camera has a lag of its own, `lag_<camera>`: a point of that camera stamped t
-shows the motion at t + lag. Its prior is about the offset that the recording states. The motion is simulated at that time;
-from there on, it follows its velocity v. All other priors are about zero.
+`scale` describes depth errors of the cameras. A single camera whose depths are 3 % too large scales the scene about the
+camera. Cameras that were registered with such depths agree at the calibration board, so their common error is a scale
+about c and a shift.
+
+A cloud stamped t shows the motion at t + lag. If the recording states `clocks`, each camera has its own lag,
+`lag_<camera>`, with a prior centred on the stated offset. The motion is simulated at this stated offset and
+extrapolated linearly by its velocity v from there. All other priors are centred on zero.
 """
 
 from __future__ import annotations
@@ -43,34 +45,34 @@ NUISANCE: dict[str, Literal["m", "rad", "s", "1"]] = {
     "lag": "s",
     "scale": "1",
 }
-"""Name -> unit."""
+"""Pose variable -> unit."""
 SET_UP = {"x": 0.002, "y": 0.002, "z": 0.002, "tilt_x": 0.005, "tilt_y": 0.005, "yaw": 0.005, "lag": 0.002}
-"""Standard deviations of a calibrated set-up [m, rad, s]: of its cameras against the robot, and of its clock."""
+"""Standard deviations for a calibrated set-up [m, rad, s]: camera extrinsics relative to the robot, and clock."""
 BY_HAND = {"x": 0.1, "y": 0.1, "yaw": math.radians(30)}
-"""Of where a hand lays a cloth that the scene places [m, rad]."""
+"""Standard deviations for a cloth that is placed by hand at its position in the scene [m, rad]."""
 _RESOLVED = {"m": 3e-4, "rad": 1.5e-3, "s": 3e-4, "1": 1.5e-3}
-"""A step as small as this is the last one to a pose; what is left changes little."""
+"""The pose search ends when all steps are smaller than this, by unit. Smaller changes hardly affect the loss."""
 _ANGLES = ("tilt_x", "tilt_y", "yaw")
 _SHIFTS = ("x", "y", "z")
 
 
 _OF_CAMERA = "lag_"
 ONE_CLOCK = {"lag": 0.0}
-"""Variable of the clock that all cameras share -> offset [s], about which its prior is."""
+"""Lag variable of a single clock that all cameras share -> centre of its prior [s]."""
 
 
 def kind_of(name: str) -> str:
-    """The name in `NUISANCE` of a variable: the lag of one camera is a `lag`."""
+    """Return the key of a variable in `NUISANCE`: the lag of one camera maps to `lag`."""
     return "lag" if name.startswith(_OF_CAMERA) else name
 
 
 def unit_of(name: str, length_unit_m: float) -> float:
-    """What one unit of a variable in a scene is in SI."""
+    """Return the SI value of one unit of a pose variable in the scene."""
     return length_unit_m if NUISANCE[kind_of(name)] == "m" else 1.0
 
 
 def clocks_of(episode: Episode) -> dict[str, float]:
-    """Variable of each camera's clock -> offset [s], about which its prior is; `ONE_CLOCK` where the episode states none.
+    """Return the lag variable of each camera -> stated offset [s], or `ONE_CLOCK` if the episode states none.
 
     Raises:
         EpisodeError: the episode's `clocks` are damaged, or its points do not name their camera.
@@ -79,8 +81,8 @@ def clocks_of(episode: Episode) -> dict[str, float]:
 
 
 def priors_by_clock(priors: Mapping[str, float], clocks: Collection[str]) -> dict[str, float]:
-    """Priors [m, rad, s, 1] with a lag for each of these clocks: its own, else `lag`, else the widest. Without any lag in
-    the priors, clocks are not free."""
+    """Return priors [m, rad, s, 1] with one lag for each of these clocks. A clock without its own prior gets that of
+    `lag`, or else the widest one. If no prior names a lag, the clocks are fixed."""
     lags = {name: sigma for name, sigma in priors.items() if kind_of(name) == "lag"}
     others = {name: sigma for name, sigma in priors.items() if name not in lags}
     usual = lags.get("lag", max(lags.values(), default=0.0))
@@ -88,9 +90,11 @@ def priors_by_clock(priors: Mapping[str, float], clocks: Collection[str]) -> dic
 
 
 def set_up_of(episode: Episode) -> dict[str, float]:
-    """`SET_UP` with the clock of an episode, as far as preprocessing has measured it, its scale, where it says how far
-    that may be off, and the `pose_sigmas` of its meta. Where the episode knows the clock of each camera, the deviation of
-    its offset is added to that of the episode's own, as independent.
+    """Return `SET_UP` updated by what the episode's meta states: measured clock offset, scale uncertainty and
+    `pose_sigmas`.
+
+    If the episode states a clock for each camera, the deviations of the camera and the episode are added as
+    independent.
 
     Raises:
         EpisodeError: the episode's meta is damaged.
@@ -113,7 +117,7 @@ def _pose_sigmas(episode: Episode) -> dict[str, float]:
 
 
 def default_priors(episode: Episode) -> dict[str, float]:
-    """Name -> standard deviation [m, rad, s, 1], of a cloth put down by hand in front of the episode's set-up.
+    """Return pose variable -> standard deviation [m, rad, s, 1] for a cloth placed by hand before calibrated cameras.
 
     Raises:
         EpisodeError: the episode's meta is damaged.
@@ -122,43 +126,45 @@ def default_priors(episode: Episode) -> dict[str, float]:
 
 
 def parse_priors(text: str) -> dict[str, float]:
-    """What `--alignment` says -> name -> standard deviation of its prior [m, rad, s, 1], as of `parse_deviations`.
+    """Parse the text of `--alignment` to pose variable -> standard deviation [m, rad, s, 1].
 
     Raises:
-        ConfigError: an unknown name or unit, a unit of something else, or what is no positive number; names it.
+        ConfigError: a name or unit is unknown, a unit does not fit the variable, or a number is not positive.
     """
     return parse_deviations(text, "alignment", NUISANCE)
 
 
 @dataclass(frozen=True)
 class PoseSpace:
-    """Which of the variables are free, and how far each may well be off."""
+    """The free pose variables and their priors."""
 
     names: tuple[str, ...]
-    """d of them."""
+    """Names of the d free variables."""
     deviations: Tensor
-    """[d] of their priors, in the scene's length unit, rad, s and 1. Values [..., d] are differences from the centre of the
-    prior, which is the offset of a clock, and zero for all others."""
+    """[d] standard deviations of the priors, in the scene's length unit, rad, s and 1. Pose values [..., d] are
+    differences from the prior's centre, which is the stated offset for a clock and zero for all others."""
     resolved: Tensor
-    """[d] a step no larger than this ends the search for a pose."""
+    """[d] step sizes below which the pose search ends."""
     prior_weights: Tensor
-    """[d] what the logarithm of the loss gains by the square of each variable (`estimation.priors`)."""
+    """[d] weights of the squared variables in the logarithm of the loss (`estimation.priors`)."""
     centre: Tensor
-    """[3] of the recording."""
+    """[3] centre of the recording, about which the scene is rotated."""
     clocks: Mapping[str, float]
-    """Variable of each of C clocks, free or not -> offset [s] about which its prior is."""
+    """Lag variable of each of the C clocks, free or not -> offset [s] on which its prior is centred."""
 
     @staticmethod
     def build(
         priors: Mapping[str, float], centre: Tensor, *, length_unit_m: float, clocks: Mapping[str, float] = ONE_CLOCK
     ) -> PoseSpace:
-        """
+        """Build the space of the pose variables that have a prior.
+
         Args:
             priors: name -> standard deviation [m, rad, s, 1].
-            clocks: variable of each clock -> offset [s].
+            centre: [3] centre of the recording.
+            clocks: lag variable of each clock -> offset [s].
 
         Raises:
-            ConfigError: an unknown name, or what is no positive number.
+            ConfigError: a name is unknown, or a standard deviation is not positive.
         """
         known = [one for name in NUISANCE for one in (clocks if name == "lag" else (name,))]
         for name, value in priors.items():
@@ -174,7 +180,7 @@ class PoseSpace:
         return PoseSpace(names, deviations, resolved, 1 / (INDEPENDENT * deviations**2), centre, clocks)
 
     def described(self, values: Tensor, *, length_unit_m: float) -> dict[str, NuisanceValue]:
-        """[d] values as records keep them: name -> value and its prior, in SI."""
+        """Convert pose values [d] to the form of the fit record: name -> value and prior, in SI units."""
         return {
             name: NuisanceValue(
                 value=float(value) * unit_of(name, length_unit_m) + self.clocks.get(name, 0.0),
@@ -185,7 +191,7 @@ class PoseSpace:
         }
 
     def of(self, described: Mapping[str, NuisanceValue], *, length_unit_m: float) -> Tensor:
-        """The inverse of `described`; what is missing there is at the centre of its prior."""
+        """Return the inverse of `described`; missing variables are at the centre of their prior."""
         values = [
             (described[name].value - self.clocks.get(name, 0.0)) / unit_of(name, length_unit_m)
             if name in described
@@ -195,12 +201,12 @@ class PoseSpace:
         return torch.tensor(values, dtype=torch.float64)
 
     def prior_factor(self, values: Tensor) -> Tensor:
-        """[B] by which the priors multiply the loss at values [B, d]."""
+        """Return factors [B] by which the priors multiply the loss at values [B, d]."""
         return (self.prior_weights * values.square()).sum(-1).exp()
 
     @property
     def unscaled(self) -> Tensor:
-        """[d] factors that leave values as they are, but for the scale, which they set to zero."""
+        """[d] factors that set the scale to zero and keep all other variables."""
         return torch.tensor([name != "scale" for name in self.names], dtype=torch.float64)
 
     @property
@@ -209,48 +215,49 @@ class PoseSpace:
         return any(name in self.clocks for name in self.names)
 
     def lags(self, values: Tensor) -> Tensor:
-        """[B, C] difference of each clock from its stated offset [s], at values [B, d]."""
+        """Return differences [B, C] of each clock from its stated offset [s], at values [B, d]."""
         return self._parts(values, tuple(self.clocks))
 
     def rotation(self, values: Tensor) -> Tensor:
-        """[B, 3, 3] of values [B, d]."""
+        """Return rotation matrices [B, 3, 3] for values [B, d]."""
         return _rotation(self._parts(values, _ANGLES))
 
     def moved(self, points: Tensor, values: Tensor) -> Tensor:
-        """[B, ..., 3] points of the scene at values [B, d] -> where the recording has them."""
+        """Transform points [B, ..., 3] from the scene to the recording's frame at values [B, d]."""
         if not self.names:
             return points
         turned = self.carried(points - self.centre, values)
         return turned + _beside(self.centre + self._parts(values, _SHIFTS), turned)
 
     def moved_motion(self, at: Callable[[Tensor], Tensor], times: Tensor, values: Tensor) -> Tensor:
-        """[T, V, 3] nodes of one motion in the recording's frame, at pose values [1, d]. With several clocks, the mean of
-        their offsets applies.
+        """Return the nodes [T, V, 3] of one motion in the recording's frame, at pose values [1, d].
+
+        If there are several clocks, the mean of their offsets is used.
 
         Args:
-            at: times [T] of the motion -> nodes [1, T, V, 3] in the scene.
+            at: function from motion times [T] to nodes [1, T, V, 3] in the scene.
             times: [T] timestamps of the recording [s].
         """
         lags = self.lags(values) + torch.tensor(list(self.clocks.values()), dtype=torch.float64)
         return self.moved(at(times + lags.mean()), values)[0]
 
     def carried(self, vectors: Tensor, values: Tensor) -> Tensor:
-        """[B, ..., 3] displacements in the scene at values [B, d] -> in the recording."""
+        """Transform displacements [B, ..., 3] from the scene to the recording's frame at values [B, d]."""
         if not self.names:
             return vectors
         return _turned(vectors, self._matrix(values))
 
     def back(self, points: Tensor, values: Tensor) -> Tensor:
-        """[..., 3] points of the recording -> [B, ..., 3] where the scene at values [B, d] has them."""
+        """Transform points [..., 3] from the recording's frame to the scene [B, ..., 3] at values [B, d]."""
         shifted = points - _beside(self.centre + self._parts(values, _SHIFTS), points[None])
         return _turned(shifted, self.rotation(values).mT / self._growth(values)[..., None]) + self.centre
 
     def rates(self, points: Tensor, values: Tensor, velocities: Tensor | None, clock: Tensor) -> Tensor:
-        """[d, B, ..., 3] derivatives of `moved` by the values.
+        """Return the derivatives [d, B, ..., 3] of `moved` with respect to the pose values.
 
         Args:
-            velocities: [B, ..., 3] of the points; needed where a lag is free.
-            clock: [B, ...] number of the clock of each point.
+            velocities: [B, ..., 3] velocities of the points; needed if a lag is free.
+            clock: [B, ...] index of each point's clock.
         """
         _, matrix, _, _, *rates = self.placements(values)
         centred, found = points - self.centre, points.new_zeros(len(self.names), *points.shape)
@@ -262,9 +269,12 @@ class PoseSpace:
         return found
 
     def placements(self, values: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
-        """What x' = matrix (x + lag v - centre) + shift consists of at values [B, d]: centre [3], matrix [B, 3, 3], shift
-        [B, 3] and lag [B, C] of each clock off its offset; and how the last three change with the values, [d, B, 3, 3],
-        [d, 3] and [d, C]."""
+        """Return the parts of x' = matrix (x + lag v - centre) + shift at values [B, d], and their derivatives.
+
+        Returns:
+            centre [3], matrix [B, 3, 3], shift [B, 3], and lag [B, C] of each clock relative to its stated offset. Then
+                the derivatives of matrix [d, B, 3, 3], shift [d, 3] and lag [d, C].
+        """
         count, free = len(values), len(self.names)
         growth, angles = self._growth(values)[..., None], self._parts(values, _ANGLES)
         matrix, shift, clocks = self._matrix(values), self._parts(values, _SHIFTS), list(self.clocks)
@@ -280,40 +290,42 @@ class PoseSpace:
                 shift_rates[place, _SHIFTS.index(name)] = 1.0
             else:
                 matrix_rates[place] = turnings[_ANGLES.index(name)]
-        centre = self.centre if free else torch.zeros_like(self.centre)  # then `moved` leaves points as they are
+        centre = self.centre if free else torch.zeros_like(self.centre)  # so that `moved` is the identity
         return centre, matrix, centre + shift, self.lags(values), matrix_rates, shift_rates, lag_rates
 
     def _matrix(self, values: Tensor) -> Tensor:
-        """[B, 3, 3] of values [B, d]: turns and scales."""
+        """Return scaled rotation matrices [B, 3, 3] for values [B, d]."""
         return self._growth(values)[..., None] * self.rotation(values)
 
     def _growth(self, values: Tensor) -> Tensor:
-        """[B, 1] of values [B, d]: how many times as large the scene shows."""
+        """Return scale factors [B, 1] for values [B, d]."""
         return self._parts(values, ("scale",)).exp()
 
     def _parts(self, values: Tensor, names: tuple[str, ...]) -> Tensor:
-        """[B, n] of values [B, d]; zero for what is not free."""
+        """Select the named columns [B, n] of values [B, d]; variables that are not free are zero."""
         zero = values.new_zeros(len(values))
         return torch.stack([values[:, self.names.index(n)] if n in self.names else zero for n in names], dim=-1)
 
 
 def _rotation(vectors: Tensor) -> Tensor:
-    """[B, 3, 3] by vectors w [B, 3]: I + sin θ / θ [w]× + (1 - cos θ) / θ² [w]×², θ = |w| (Rodrigues)."""
+    """Return rotation matrices [B, 3, 3] of rotation vectors w [B, 3] with θ = |w|: I + sin θ / θ [w]× + (1 - cos θ) /
+    θ² [w]×² (Rodrigues' formula)."""
     cross, (first, second, _) = _cross(vectors), _weights(vectors)
     return torch.eye(3, dtype=vectors.dtype) + first * cross + second * (cross @ cross)
 
 
 def _turnings(vectors: Tensor) -> Tensor:
-    """[3, B, 3, 3] the derivatives of the rotation by w along each axis e: [J e]× times the rotation, with
-    J = I + (1 - cos θ) / θ² [w]× + (θ - sin θ) / θ³ [w]×² (Chirikjian 2012, section 10.8)."""
+    """Return the derivatives [3, B, 3, 3] of the rotation with respect to the components of w. Along axis e it is [J
+    e]× times the rotation, with J = I + (1 - cos θ) / θ² [w]× + (θ - sin θ) / θ³ [w]×² (Chirikjian 2012, section
+    10.8)."""
     cross, (_, second, third) = _cross(vectors), _weights(vectors)
     jacobian = torch.eye(3, dtype=vectors.dtype) + second * cross + third * (cross @ cross)
     return _cross(jacobian.movedim(-1, 0)) @ _rotation(vectors)
 
 
 def _weights(vectors: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """[B, 1, 1] sin θ / θ, (1 - cos θ) / θ² and (θ - sin θ) / θ³ of vectors of length θ [B, 3], for θ = 0 too: what
-    rounding leaves of the last is multiplied by θ²."""
+    """Return sin θ / θ, (1 - cos θ) / θ² and (θ - sin θ) / θ³, each [B, 1, 1], for vectors [B, 3] of length θ. θ = 0 is
+    allowed. Rounding errors of the last term do not matter there, because it is multiplied by θ²."""
     squared = vectors.square().sum(-1)[:, None, None]
     turns = squared.sqrt() / torch.pi
     first = torch.sinc(turns)
@@ -321,17 +333,17 @@ def _weights(vectors: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def _turned(points: Tensor, rotation: Tensor) -> Tensor:
-    """[B, ..., 3] points by [B, 3, 3]."""
+    """Rotate points [B, ..., 3] by matrices [B, 3, 3]."""
     return (points.flatten(1, -2) @ rotation.mT).reshape(points.shape)
 
 
 def _beside(vector: Tensor, points: Tensor) -> Tensor:
-    """[B, 3] -> [B, 1, ..., 3] as points [B, ..., 3] have dimensions."""
+    """Reshape vectors [B, 3] to [B, 1, ..., 3], so that they broadcast with points [B, ..., 3]."""
     return vector.reshape(len(vector), *[1] * (points.dim() - 2), 3)
 
 
 def _cross(vector: Tensor) -> Tensor:
-    """[..., 3] -> [..., 3, 3] that multiplies like a cross product."""
+    """Return the matrix [..., 3, 3] of the cross product with vectors [..., 3]."""
     x, y, z = vector.unbind(-1)
     zero = torch.zeros_like(x)
     return torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1).unflatten(-1, (3, 3))

@@ -1,11 +1,12 @@
-"""How much a prior says, of the pose and of the parameters, beside a recording; and the priors of parameters.
+"""Weight of the priors relative to the data, and the priors of parameters.
 
-A multiplier has a log-normal prior about the nominal material: one deviation off is a factor. Nobody knows beforehand how
-noisy a recording is, or how well the simulator can explain it. With N independent residuals of one unknown variance, the
-posterior is highest where N log L + Σ d² is lowest; L is the loss, and d how far each variable is from its centre, in
-standard deviations of its prior. So priors multiply the loss by exp(Σ d² / N): at one deviation by one hundredth more, far
-less than a recording says of what it shows. They decide where nothing is shown, and hold where the simulator explains
-little.
+A multiplier has a log-normal prior about the nominal material, so one standard deviation is a factor. The noise and
+model error of a recording are not known beforehand. With N independent residuals of one unknown variance, the posterior
+is maximal where N log L + Σ d² is minimal. Here L is the loss, and d is the distance of each variable from the centre
+of its prior, in standard deviations.
+
+So priors multiply the loss by exp(Σ d² / N). One standard deviation raises the loss by only one percent. Priors
+therefore matter only where the data are uninformative.
 """
 
 from __future__ import annotations
@@ -17,25 +18,24 @@ from diffcloud.quantities import parse_factor
 from diffcloud.sim.properties import PARAMETERS
 
 DEFAULT_FACTOR = 10.0
-"""One deviation of a multiplier."""
+"""Default standard deviation of a multiplier, as a factor."""
 _MOST_FACTOR = 1e6
-"""A prior as wide says nothing."""
+"""Largest allowed factor; a wider prior has no effect."""
 INDEPENDENT = 100
-"""Residuals of a recording that count as independent."""
+"""Assumed number N of independent residuals in a recording."""
 
 
 def parameter_priors(text: str | None, names: Sequence[str], bounds: Mapping[str, tuple[float, float]]) -> dict[str, float]:
-    """What `--prior` says -> fitted parameter -> factor of one deviation.
+    """Parse the text of `--prior` to fitted parameter -> standard deviation as a factor.
 
     Args:
-        text: None for the default of every fitted multiplier whose bounds hold the nominal value, 1; "none"; or parameters
-            with a factor, as in "bending=3x,density=1.5x", the default for the others.
+        text: "none", or parameters with factors such as "bending=3x,density=1.5x". Parameters that are not named, or
+            all if None, get the default if their bounds contain the nominal value 1.
         names: fitted parameters.
-        bounds: of each.
 
     Raises:
-        ConfigError: a parameter that is not fitted or has no multiplier, a factor that is none, or bounds without the
-            nominal value.
+        ConfigError: a parameter is not fitted or has no multiplier, a factor is invalid, or bounds exclude the nominal
+            value.
     """
     if text is not None and text.strip() == "none":
         return {}

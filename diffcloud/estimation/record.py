@@ -1,4 +1,4 @@
-"""What a fit's JSON holds, typed: one model from the fit through the comparison to the report."""
+"""Data model of a fit's JSON file. The fit, the comparison of methods and the report all use it."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from diffcloud.io.schema import Plain
 from diffcloud.io.timings import read_seconds
 
 SCHEMA = 13
-"""Of the file. Another one is refused, by name."""
+"""Version of the file format. Files of other versions are rejected."""
 
 LARGEST = 1e12
 NonNegative = Annotated[float, Field(ge=0, le=LARGEST)]
 Positive = Annotated[float, Field(gt=0, le=LARGEST)]
 Value = Annotated[float, Field(ge=-LARGEST, le=LARGEST)]
-"""Of a variable; those of how a cloth lies may be negative."""
+"""Value of a variable. Initial-state variables may be negative."""
 Count = Annotated[int, Field(ge=0, le=1_000_000_000)]
 Text = Annotated[str, Field(max_length=1000)]
 Friction = Annotated[float, Field(ge=0, le=100)]
@@ -33,20 +33,20 @@ class _Model(Plain):
 
 
 class NuisanceValue(_Model):
-    """One variable of how a recording lies."""
+    """Value and prior of one pose or initial-state variable of a recording."""
 
     value: Pose
     prior: Annotated[float, Field(gt=0, le=1e3)]
-    """Standard deviation of its prior, about the offset of a clock (`RecordingFit.clocks`), or about zero."""
+    """Standard deviation of the prior, which is centred on the stated clock offset for a lag, and else on zero."""
     unit: Literal["m", "rad", "s", "1"]
-    """Of both."""
+    """Unit of value and prior."""
     of: Literal["pose", "cloth"] = "pose"
-    """Of the scene against the recording (`estimation.pose`), or of the cloth when its motion begins
+    """`pose`: scene relative to the recording (`estimation.pose`). `cloth`: initial state
     (`estimation.initial_state`)."""
 
 
 class LeftOut(_Model):
-    """What the other recordings of a joint fit say of one: fitted to them alone, measured on it."""
+    """Leave-one-out result: parameters fitted to the other recordings, evaluated on this one."""
 
     loss: NonNegative
     rms_mm: NonNegative
@@ -54,35 +54,35 @@ class LeftOut(_Model):
 
 
 class RecordingFit(_Model):
-    """One recording beside the motion fitted to it, in SI but for `loss` and `centre`."""
+    """Result for one recording, in SI units except for `loss` and `centre`."""
 
     name: Text
     scenario: Text
     loss: NonNegative
-    """[squared length unit of the scenario]"""
+    """Loss of this recording [squared length unit of the scenario]."""
     rms_mm: NonNegative
     rms_to_recording_mm: NonNegative
-    """From cloth to recording."""
+    """RMS distance from the cloth to the recorded points."""
     rms_to_cloth_mm: NonNegative | None
-    """From recording to cloth; the paper's measure does not look that way."""
+    """RMS distance from the recorded points to the cloth; None with the loss of the paper."""
     grasp: Text = ""
-    """What holds the cloth; empty where it is nodes."""
+    """Description of the grasp; empty if the scene holds fixed nodes."""
     frames: list[Count]
-    """That were compared."""
+    """Numbers of the compared frames."""
     frame_rms_mm: list[NonNegative]
-    """Of each."""
+    """RMS distance in each compared frame."""
     counted: list[Annotated[float, Field(ge=0, le=1)]]
-    """Part of the simulated points that count, in each."""
+    """Fraction of the simulated points that were compared, in each frame."""
     cut_m: Pose | None
-    """Height below which nothing was recorded."""
+    """Height below which the recording was cropped [m]."""
     nuisance: dict[str, NuisanceValue]
-    """How the recording lies."""
+    """Pose and initial-state variables."""
     centre: tuple[Pose, Pose, Pose]
-    """[3] of the recording, about which the scene is turned [length unit]."""
+    """[3] centre of the recording, about which the scene is rotated [length unit]."""
     clocks: dict[str, Pose] = Field(default_factory=lambda: {"lag": 0.0}, min_length=1)
-    """Variable of the lag of each clock, in `nuisance` where it is free -> offset [s] that the recording states."""
+    """Lag variable of each clock -> offset [s] that the recording states. Free ones are also in `nuisance`."""
     left_out: LeftOut | None = None
-    """In a joint fit of several recordings."""
+    """Leave-one-out result, in a joint fit."""
 
     @field_validator("nuisance")
     @classmethod
@@ -99,80 +99,80 @@ class RecordingFit(_Model):
 
 
 class FittedParameter(_Model):
-    """One parameter, fitted or given, and what it means."""
+    """One fitted or fixed parameter."""
 
     value: NonNegative
-    """In `unit`, which is SI if the scene is."""
+    """Value in `unit`, which is SI if the scene is in SI units."""
     unit: Text
     meaning: Text
     nominal: NonNegative = 1.0
-    """Value of the scene's own material, on which the simulator's multiplier acts; 1 where there is no multiplier."""
+    """Value of the scene's own material, to which the multiplier refers; 1 if the parameter has no multiplier."""
     multiplier: NonNegative
-    """What the simulator takes: the value over `nominal`."""
+    """Input of the simulator: value divided by `nominal`."""
     fixed: bool = False
     bounds: tuple[NonNegative, NonNegative] | None = None
-    """Of a fitted one."""
+    """Search range of a fitted parameter."""
     prior: Annotated[float, Field(gt=1, le=1e6)] | None = None
-    """Factor of one deviation of its log-normal prior; None: none."""
+    """Standard deviation of the log-normal prior, as a factor; None: no prior."""
     centre: Positive | None = None
-    """Of the prior of a fitted one, in `unit`."""
+    """Centre of the prior of a fitted parameter, in `unit`."""
     role: Role = "requested"
-    """Other than requested: a nuisance, fitted because it is not known exactly."""
+    """All roles other than `requested` are nuisance parameters."""
     at_bound: bool = False
 
 
 class WholeMaterial(_Model):
-    """All that the cloth was simulated with, fitted or not, in the scene's units, which are SI unless `length_unit_m` says
-    otherwise; stiffness at rest."""
+    """All material properties of the simulated cloth, fitted or not. Stiffness is that at rest. Values are in the
+    scene's units, which are SI unless `length_unit_m` differs from 1."""
 
     density: Positive
-    """[kg/m²] Mean over the cloth."""
+    """[kg/m²] mean over the cloth."""
     stretching: Positive
-    """[N/m] Force per width per strain of a strip whose sides are free."""
+    """[N/m] force per width per strain of a strip with free sides."""
     poisson: Annotated[float, Field(gt=-1, lt=1)]
     shear: Positive
-    """[N/m] Force per width per shear angle."""
+    """[N/m] force per width per shear angle."""
     compression: Annotated[float, Field(ge=0, le=1)]
-    """Part of the stretching stiffness that resists compression."""
+    """Fraction of the stretching stiffness that resists compression."""
     bending: NonNegative
-    """[N·m] Bending stiffness per width."""
+    """[N·m] bending stiffness per width."""
     damping: NonNegative
-    """[s] Proportional to the stiffness."""
+    """[s] stiffness-proportional damping."""
     friction: Friction
     self_friction: Friction
     air_density: NonNegative
-    """[kg/m³]"""
+    """[kg/m³] density of the air."""
     added_mass: NonNegative
-    """[kg/m²] Of the air that moves with the cloth, mean over the cloth."""
+    """[kg/m²] mass of the air that moves with the cloth, mean over the cloth."""
     linear_drag: NonNegative
-    """[kg/(m²·s)]"""
+    """[kg/(m²·s)] drag of the air per area that is linear in speed."""
 
 
 class Measure(_Model):
-    """What recording and motion are compared by: keyword arguments of `Objective`, for a recording that is new to the fit;
-    `FitRecord.measured_by` has those for one that it knows."""
+    """Keyword arguments of `Objective` for a recording that is new to the fit. `FitRecord.measured_by` returns those
+    for a fitted recording."""
 
     paper: bool
     nuisance: dict[str, Annotated[float, Field(gt=0, le=1e3)]]
-    """Free variables of the pose -> standard deviation of the prior [m, rad, s]; of the first recording."""
+    """Free pose variables of the first recording -> standard deviation of the prior [m, rad, s]."""
     frames: list[int] | None
-    """Requested; None: the scenario's, or every usable one."""
+    """Requested frames; None: the scenario's, or all usable ones."""
     points: Annotated[int, Field(ge=1, le=10_000_000)] | None
-    """Requested; None: the scenario's."""
+    """Requested number of points; None: the scenario's."""
     seed: Annotated[int, Field(ge=0)]
 
 
 class History(_Model):
-    """N iterations of B starts; k parameters. What diverged, or grew beyond `LARGEST`, is None."""
+    """History of N iterations, B starts and k variables. None stands for diverged values and values above `LARGEST`."""
 
     names: list[Text]
-    """[k]"""
+    """[k] names of the variables."""
     loss: list[list[NonNegative | None]]
-    """[N][B]"""
+    """[N][B] losses."""
     values: list[list[list[Value | None]]]
-    """[N][B][k]"""
+    """[N][B][k] values."""
     gradient_norm: list[list[NonNegative | None]]
-    """[N][B]; empty of a search."""
+    """[N][B]; empty for a search."""
 
     @model_validator(mode="after")
     def _has_one_shape(self) -> Self:
@@ -187,30 +187,30 @@ class History(_Model):
 
 
 class Followed(_Model):
-    """How far the model follows one recording."""
+    """Agreement of the model with one recording."""
 
     horizon_s: float
-    """Frames after it did not count [s]."""
+    """Frames after this time were not used [s]."""
     chi_squares: list[NonNegative]
-    """Of each frame that counted, its mean squared distance over what noise, spacing and mesh account for."""
+    """Mean squared distance of each used frame, divided by the variance expected from noise, point spacing and mesh."""
     finer_mm: list[NonNegative]
-    """By how much a mesh of half the edge length moves the cloth in each, RMS over the nodes."""
+    """RMS node displacement in each used frame when the mesh is refined to half the edge length."""
 
 
 class EstimateRecord(_Model):
-    """What the solver `likelihood` says of the requested parameters, on the axis of the fit; k of them."""
+    """Estimate of the k requested parameters by the solver `likelihood`, in the fit coordinates (`residuals.Axis`)."""
 
     mean: dict[str, Value]
-    """Of all answers, by their likelihoods."""
+    """Mean over all starts, weighted by their likelihoods."""
     sources: dict[str, list[list[Annotated[float, Field(ge=-1e9, le=1e9)]]]]
-    """Source -> its part of the covariance [k][k]."""
+    """Source of uncertainty -> its contribution to the covariance [k][k]."""
     starts: list[dict[str, Value]]
-    """Where each start ended, the likeliest first."""
+    """Result of each start, the most likely first."""
     weights: list[Annotated[float, Field(ge=0, le=1)]]
-    """Of these."""
+    """Weights of the starts."""
     recordings: list[Followed] = Field(min_length=1)
     grip_m: Annotated[float, Field(gt=0, le=10)] | None = None
-    """Size of the grasp that was found, with which the fit is simulated; None where it was known."""
+    """Estimated size of the grasp, which the final simulation uses; None if it was known."""
 
     @model_validator(mode="after")
     def _has_one_shape(self) -> Self:
@@ -223,53 +223,53 @@ class EstimateRecord(_Model):
 
 
 class FitRecord(_Model):
-    """One fit."""
+    """Complete record of one fit."""
 
     schema_version: int = Field(default=SCHEMA, alias="schema")
     scenario: Text
-    """Of the first recording."""
+    """Scenario of the first recording."""
     episodes: list[RecordingFit] = Field(min_length=1)
     nuisance: dict[str, NuisanceValue]
-    """How the only recording lies; empty in a joint fit, where each episode has its own."""
+    """Pose and initial state of the only recording. It is empty in a joint fit, where each episode has its own."""
     solver: Text
-    """Of `SOLVERS`."""
+    """Key in `SOLVERS`."""
     parameters: dict[str, FittedParameter] = Field(min_length=1)
     material: WholeMaterial
     loss: NonNegative
-    """[squared length unit, mean over points], by the fit's own random points, without priors; of a joint fit the geometric
-    mean over its recordings, with `paper` the plain one."""
+    """[squared length unit, mean over points] without priors, at the fit's own sample points. In a joint fit it is the
+    geometric mean over the recordings, with `paper` the arithmetic mean."""
     loss_start: NonNegative
-    """At `start`, with priors."""
+    """Loss at `start`, with priors."""
     loss_resampled: NonNegative
-    """Mean over fresh points, which the fit could not adapt to."""
+    """Mean loss at newly sampled points, to which the fit could not adapt."""
     rms_mm: NonNegative
     length_unit_m: Annotated[float, Field(gt=0, le=1e3)]
     iterations: Count
     simulations: Annotated[int, Field(ge=1, le=1_000_000_000)]
-    """Runs of the simulator; one with derivatives counts once. Those of fits that leave a recording out do not."""
+    """Number of simulator runs. A run with derivatives counts once. Leave-one-out fits are not included."""
     seconds: NonNegative | None = Field(default=None, exclude=True)
-    """Wall time, which lies beside the file (`io.timings`); None where it is not known."""
+    """Wall time, stored in a separate file (`io.timings`); None if unknown."""
     stop_reason: Literal["converged", "iterations", "simulations", "threshold", "interrupted"]
     start: dict[str, Value]
-    """Parameters of the first start, the given ones too, and how the cloth lies, named as in `free`."""
+    """Values of the first start, including fixed parameters and the initial state, named as in `free`."""
     best_start: Annotated[int, Field(ge=0, le=1_000_000)]
     measure: Measure
     settings: dict[str, Annotated[int, Field(ge=0)] | bool | NonNegative | None]
-    """Of the solver."""
+    """Settings of the solver."""
     history: History
     estimate: EstimateRecord | None = None
-    """Of the solver `likelihood`."""
+    """Result of the solver `likelihood`; None for other solvers."""
     failures: list[str]
-    """Of starts that diverged."""
+    """Messages of diverged starts."""
     fingerprint: Text = ""
-    """Of inputs and code, by which a later call knows a finished fit."""
+    """Hash of inputs and code, by which a later call recognises a finished fit."""
 
     def initial_state_in(self, recording: RecordingFit | None) -> dict[str, float]:
-        """Name -> value, of how the cloth lies when a recording's motion begins, as the simulator takes it
-        (`estimation.initial_state`).
+        """Return the initial-state variables of a recording in simulator units (`estimation.initial_state`): name ->
+        value.
 
         Args:
-            recording: one of `episodes`; None: one that is new to the fit, of which is known what all share.
+            recording: one of `episodes`. None: a new recording, for which only the shared variables are known.
         """
         unit = {"m": self.length_unit_m, "rad": 1.0, "1": 1.0}
         return {
@@ -279,13 +279,13 @@ class FitRecord(_Model):
         }
 
     def place_of(self, name: str, scenario: str | None = None) -> int:
-        """Of a recording in `episodes`.
+        """Return the index of a recording in `episodes`.
 
         Args:
-            scenario: that the fit simulates it in; needed where it has two recordings of this name.
+            scenario: scenario of the recording; needed if two recordings have the same name.
 
         Raises:
-            ConfigError: none, or several.
+            ConfigError: no recording matches, or several do.
         """
         if name not in {one.name for one in self.episodes}:
             raise ConfigError(unknown_name("recording of the fit", name, {one.name for one in self.episodes}))
@@ -299,18 +299,18 @@ class FitRecord(_Model):
         return next(iter(found.values()))
 
     def known_place(self, name: str, scenario: str | None = None) -> int | None:
-        """As `place_of`; None where the fit knows no recording of this name.
+        """Return the same as `place_of`, or None if the fit has no recording of this name.
 
         Raises:
-            ConfigError: several.
+            ConfigError: several recordings match.
         """
         return self.place_of(name, scenario) if name in {one.name for one in self.episodes} else None
 
     def measured_by(self, recording: int) -> dict[str, Any]:
-        """Keyword arguments of `Objective` with which a recording was compared, with its own pose and frames.
+        """Return the keyword arguments of `Objective` for a fitted recording, with its own pose priors and frames.
 
         Args:
-            recording: its place in `episodes`.
+            recording: index in `episodes`.
         """
         one = self.episodes[recording]
         pose = {name: entry.prior for name, entry in one.nuisance.items() if entry.of == "pose"}
@@ -318,28 +318,28 @@ class FitRecord(_Model):
 
     @property
     def grasps(self) -> str:
-        """What holds the cloth in its recordings, for people; empty where nodes are held as they are."""
+        """Description of the grasps in all recordings; empty if only fixed nodes are held."""
         return "; ".join(dict.fromkeys(one.grasp for one in self.episodes if one.grasp))
 
     @property
     def values(self) -> dict[str, float]:
-        """Parameter -> multiplier, the given ones too."""
+        """Parameter -> multiplier, including fixed parameters."""
         return {name: parameter.multiplier for name, parameter in self.parameters.items()}
 
     @property
     def fitted(self) -> dict[str, float]:
-        """Requested parameter -> multiplier."""
+        """Requested parameter -> fitted multiplier."""
         return {name: one.multiplier for name, one in self.parameters.items() if not (one.fixed or one.role != "requested")}
 
     @property
     def free(self) -> dict[str, float]:
-        """Name -> value, of all that was fitted: requested, uncertain material, and of how the cloth lies."""
+        """Name -> value of all fitted variables: requested, uncertain material and initial state."""
         material = {name: parameter.multiplier for name, parameter in self.parameters.items() if not parameter.fixed}
         return {**material, **self._initial_states}
 
     @property
     def simulated(self) -> dict[str, float]:
-        """Name -> value, of all that the fitted motions were simulated with, named as in `free`."""
+        """Name -> value of all variables in the simulation, named as in `free`."""
         return {**self.values, **self._initial_states}
 
     @property
@@ -347,7 +347,7 @@ class FitRecord(_Model):
         return of_all([self.initial_state_in(one) for one in self.episodes])
 
     def plain(self) -> dict[str, Any]:
-        """As the file has it."""
+        """Return the content of the JSON file."""
         return self.model_dump(mode="json", by_alias=True)
 
 
@@ -356,18 +356,19 @@ def _is_record(told: Any) -> bool:
 
 
 def is_fit(path: Path) -> bool:
-    """Whether a JSON file holds a fit, of whatever version.
+    """Return whether a JSON file is a fit record, of any version.
 
     Raises:
-        ConfigError: missing, or no JSON.
+        ConfigError: the file is missing or not JSON.
     """
     return _is_record(read_json(path, error=ConfigError))
 
 
 def read_fit(path: Path) -> FitRecord:
-    """
+    """Read a fit record.
+
     Raises:
-        ConfigError: missing, damaged, not a fit, or one of another version.
+        ConfigError: the file is missing or damaged, is not a fit, or has another version.
     """
     told = read_json(path, error=ConfigError)
     if not _is_record(told):

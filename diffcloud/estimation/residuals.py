@@ -1,9 +1,10 @@
-"""How a motion changes with what is fitted.
+"""Derivatives of a motion with respect to the fitted variables.
 
-Variables are fitted on an axis of their own: the logarithm of a value whose lower bound is positive, the standard
-deviations off zero of one with a normal prior, else the part of its range. Where the integrator's derivatives hold over
-finite distances (the implicit one: docs/results/gradients.md), they are forward tangents, from one simulation. The
-arcsim integrator's contact is rough: there, motions a finite step to both sides give the differences.
+Variables are fitted in their own coordinates (`Axis`). The coordinate is the logarithm if the lower bound is positive.
+It is the number of standard deviations from zero for a normal prior, and the fraction of the range otherwise. The
+implicit integrator's derivatives are valid over finite distances (docs/results/gradients.md), so forward-mode
+derivatives from one simulation are used. The contact model of the arcsim integrator is non-smooth. There, central
+differences over finite steps are used.
 """
 
 from __future__ import annotations
@@ -22,22 +23,22 @@ from diffcloud.sim.integrators import load_integrator
 from diffcloud.sim.simulate import Rollout
 
 STEP = 0.05
-"""Of the differences, on the axis: 5 % of a value."""
+"""Step of the central differences in fit coordinates: 5 % of a value."""
 
 
 @dataclass(frozen=True)
 class Axis:
-    """The axis [k] on which variables are fitted."""
+    """Fit coordinates of k variables."""
 
     low: Tensor
-    """[k] values."""
+    """[k] lower bounds of the values."""
     high: Tensor
     logarithmic: Tensor
-    """bool [k]"""
+    """bool [k], whether the coordinate is the logarithm."""
     zero: Tensor
-    """[k] value at place zero of those that are not."""
+    """[k] value at coordinate 0, for variables that are not logarithmic."""
     scale: Tensor
-    """[k] from there to place one."""
+    """[k] difference of the values at coordinates 1 and 0."""
 
     @staticmethod
     def of(space: FitSpace) -> Axis:
@@ -51,39 +52,39 @@ class Axis:
 
     @property
     def ends(self) -> tuple[Tensor, Tensor]:
-        """[k] where the bounds lie."""
+        """[k] coordinates of the lower and upper bounds."""
         return self.places(self.low), self.places(self.high)
 
     def places(self, values: Tensor) -> Tensor:
-        """[..., k] values -> places on the axis."""
+        """Convert values [..., k] to fit coordinates."""
         safe = torch.where(self.logarithmic, values, 1.0)
         return torch.where(self.logarithmic, safe.log(), (values - self.zero) / self.scale)
 
     def values(self, places: Tensor) -> Tensor:
-        """The inverse of `places`. A place on a bound may be off it by rounding."""
+        """Return the inverse of `places`. At a bound, rounding errors may exceed the bound."""
         return torch.where(self.logarithmic, places.exp(), self.zero + self.scale * places)
 
     def bounded(self, places: Tensor) -> Tensor:
-        """The same, no digit beyond a bound; a derivative would end there."""
+        """Return `values` clipped exactly to the bounds; the gradient vanishes outside."""
         return torch.minimum(torch.maximum(self.values(places), self.low), self.high)
 
 
 def by_tangents(objective: Objective) -> bool:
-    """Whether the derivatives of its integrator hold over finite distances."""
+    """Return whether derivatives of the scenario's integrator are valid over finite distances."""
     return load_integrator(objective.scenario.scene.integrator).smooth
 
 
 @dataclass(frozen=True)
 class Moved:
-    """Motions of B places."""
+    """Motions of B parameter sets and their derivatives."""
 
     run: Rollout
     rates: Tensor
-    """[k, B, L, C · V, 3] of their nodes at the compared frames, as `Objective.looked_at` has them."""
+    """[k, B, L, C · V, 3] derivatives of the nodes at the compared frames, in the layout of `Objective.looked_at`."""
 
 
 def moved_by(objective: Objective, space: FitSpace, places: Tensor) -> Moved:
-    """Motions of B places [B, k], and how they change."""
+    """Simulate parameter sets [B, k] in fit coordinates, with derivatives."""
     return (_by_tangents if by_tangents(objective) else _by_differences)(objective, space, places)
 
 
@@ -102,9 +103,10 @@ def _by_tangents(objective: Objective, space: FitSpace, places: Tensor) -> Moved
 
 
 def _by_differences(objective: Objective, space: FitSpace, places: Tensor) -> Moved:
-    """
+    """Simulate parameter sets with central differences.
+
     Raises:
-        DivergedError: names the places beside which a motion diverges, or at which.
+        DivergedError: names the parameter sets whose motion, or a neighbouring motion, diverges.
     """
     axis, count = Axis.of(space), len(places)
     above, below = _sides(axis, places)
@@ -124,21 +126,21 @@ def _by_differences(objective: Objective, space: FitSpace, places: Tensor) -> Mo
 
 
 def _sides(axis: Axis, places: Tensor) -> Tensor:
-    """[2, k, B, k] places above and below each of B places [B, k], along each variable, between the bounds."""
+    """Return coordinates [2, k, B, k] one step above and below [B, k] along each variable, clipped to the bounds."""
     low, high = axis.ends
     steps = STEP * _ways(places)
     return torch.stack([torch.minimum(torch.maximum(places + sign * steps, low), high) for sign in (1, -1)])
 
 
 def _ways(places: Tensor) -> Tensor:
-    """[k, B, k] each variable's direction."""
+    """Return the unit vectors [k, B, k] of each variable."""
     return torch.eye(places.shape[1], dtype=places.dtype)[:, None].expand(-1, len(places), -1)
 
 
 @torch.enable_grad()
 def _along(function: Callable[[Tensor], tuple[Tensor, ...]], at: Tensor, ways: Tensor) -> list[tuple[Tensor, ...]]:
-    """The directional derivatives of tensors, by reverse mode twice, from sums alone: torch's forward mode takes seconds to
-    start, and so does its reverse mode with weights of one's own."""
+    """Return directional derivatives of tensors by applying reverse mode twice. torch's own forward mode takes seconds
+    to start, and so does its reverse mode with custom weights. So only sums are differentiated."""
     at = at.detach().requires_grad_()
     values = function(at)
     weights = [torch.zeros_like(value, requires_grad=True) for value in values]

@@ -1,4 +1,4 @@
-"""A finished fit: simulated once more, described, and written."""
+"""Description and output of a finished fit, which is simulated once more for this."""
 
 from __future__ import annotations
 
@@ -43,50 +43,50 @@ from diffcloud.sim.properties import PARAMETERS, one_set
 from diffcloud.sim.simulate import Rollout
 
 _AT_BOUND = 0.01
-"""Part of the range from an end within which a value counts as there; of the logarithmic range, if no bound is zero."""
+"""A value counts as at its bound within this fraction of the range, logarithmic if no bound is zero."""
 _FARTHEST = 1e6
-"""Of a place or time in a motion."""
+"""Largest plausible coordinate or time in a motion file."""
 
 
 @dataclass(frozen=True)
 class FittedMotion:
-    """What is simulated with the fitted parameters, in the scene's unit and one recording's frame: its pose applied."""
+    """Simulation with the fitted parameters and pose, in the scene's unit and the recording's frame."""
 
     nodes: NDArray[np.float64]
-    """[T + 1, V, 3] of the cloth at each frame, as far as the motion goes."""
+    """[T + 1, V, 3] cloth nodes at each frame, up to the end of the motion."""
     start_nodes: NDArray[np.float64]
-    """[T + 1, V, 3] at the first start's parameters, at the pose found with these."""
+    """[T + 1, V, 3] cloth nodes with the parameters of the first start, at their best pose."""
     faces: NDArray[np.int64]
-    """[F, 3]"""
+    """[F, 3] faces of the cloth."""
     times: NDArray[np.float64]
-    """[T + 1] [s]"""
+    """[T + 1] times of the frames [s]."""
     bodies: SurfaceMesh
-    """Fixed bodies around the cloth, without tables."""
+    """Fixed bodies other than tables."""
     held: NDArray[np.int64]
-    """[K] nodes that something holds."""
+    """[K] grasped or fixed nodes."""
     held_times: NDArray[np.float64]
-    """[S + 1] of every step [s]"""
+    """[S + 1] times of all steps [s]."""
     held_nodes: NDArray[np.float64]
-    """[S + 1, K, 3] where they are then."""
+    """[S + 1, K, 3] positions of these nodes at all steps."""
 
 
 @dataclass(frozen=True)
 class FitResult:
-    """What `write_fit` stores."""
+    """Record and motions of a fit, as `write_fit` stores them."""
 
     record: FitRecord
-    """The JSON file."""
+    """Content of the JSON file."""
     motions: list[FittedMotion]
-    """The NPZ file: one for each recording."""
+    """Content of the NPZ file, one motion per recording."""
     pressed: bool = False
-    """Whether Ctrl-C was pressed after the last step: nothing is lost, and who asked for the fit may want to stop."""
+    """Whether Ctrl-C was pressed after the last step. The result is complete, but the caller may want to stop."""
 
 
 def physical_values(scenario: Scenario, values: Mapping[str, float]) -> dict[str, FittedParameter]:
-    """Return each parameter with what it means.
+    """Return each parameter with value, unit and meaning.
 
     Args:
-        values: parameter -> multiplier, or the value itself where the simulator takes that.
+        values: parameter -> multiplier, or value for a parameter without a multiplier.
     """
     return {
         name: FittedParameter(
@@ -101,7 +101,7 @@ def physical_values(scenario: Scenario, values: Mapping[str, float]) -> dict[str
 
 
 def whole_material(scenario: Scenario, values: Mapping[str, float]) -> WholeMaterial:
-    """The material of the scenario with parameters of these values; what they leave out is the nominal material's."""
+    """Return all material properties of a scenario with these parameter values; the others are nominal."""
     material = scenario.scene.material
     system, _ = scenario.scene.build()
     changed = scenario.properties(system, one_set(values))
@@ -133,10 +133,11 @@ def describe_fit(
     episodes: Sequence[str],
     resampled_seeds: int = 4,
 ) -> FitResult:
-    """Simulate the result and put everything together.
+    """Simulate the fitted parameters and build the record.
 
     Args:
         episodes: names of the recordings.
+        resampled_seeds: number of point samples for `loss_resampled`.
 
     Raises:
         DivergedError: the motion diverges within the compared frames.
@@ -170,7 +171,7 @@ def describe_fit(
             resampled.append(float(mean_loss(torch.stack(losses)[:, None], paper=paper)))
         objective.reseed(settings.seed)
     of_each = torch.tensor([[recording.loss] for recording in recordings], dtype=torch.float64)
-    loss = float(mean_loss(of_each, paper=paper))  # by itself, not in a solver's batch
+    loss = float(mean_loss(of_each, paper=paper))  # computed separately, so it does not depend on a solver's batch
     record = FitRecord(
         scenario=first.scenario.name,
         episodes=recordings,
@@ -205,7 +206,7 @@ def describe_fit(
 
 
 def _rms_mm(recordings: Sequence[RecordingFit], *, paper: bool) -> float:
-    """Of all recordings together, their mean squares averaged as their losses are."""
+    """Average the RMS over all recordings in the same way as the losses."""
     if len(recordings) == 1:
         return recordings[0].rms_mm
     squares = torch.tensor([[recording.rms_mm**2] for recording in recordings], dtype=torch.float64)
@@ -213,11 +214,7 @@ def _rms_mm(recordings: Sequence[RecordingFit], *, paper: bool) -> float:
 
 
 def describe_recording(objective: Objective, run: Rollout, name: str) -> RecordingFit:
-    """One recording beside the motion fitted to it.
-
-    Args:
-        name: of the recording.
-    """
+    """Return the result for one recording."""
     unit, space, handles = objective.scenario.length_unit_m, objective.pose_space, objective.scenario.scene.handles
     motion = objective.match(run)
     losses, squares, ways = objective.losses(motion)[0], objective.squares(motion)[0], objective.way_squares(motion)
@@ -242,7 +239,7 @@ def describe_recording(objective: Objective, run: Rollout, name: str) -> Recordi
 
 
 def recorded_pose(recording: RecordingFit, *, length_unit_m: float) -> tuple[PoseSpace, Tensor]:
-    """The pose that a fit found for a recording, and its values [1, d]."""
+    """Return the pose variables of a recorded fit and their values [1, d]."""
     priors = {name: entry.prior for name, entry in recording.nuisance.items() if entry.of == "pose"}
     centre = torch.tensor(recording.centre, dtype=torch.float64)
     space = PoseSpace.build(priors, centre, length_unit_m=length_unit_m, clocks=recording.clocks)
@@ -250,8 +247,9 @@ def recorded_pose(recording: RecordingFit, *, length_unit_m: float) -> tuple[Pos
 
 
 def write_fit(folder: Path, name: str, result: FitResult) -> Path:
-    """Write `<name>.npz` (nodes, start_nodes, faces, times, obstacle_nodes, obstacle_faces, held, held_times, held_nodes;
-    of a second recording nodes_1 and so on) and `<name>.json` together; returns the latter."""
+    """Write `<name>.npz` and `<name>.json` together, and return the path of the latter. The arrays are nodes,
+    start_nodes, faces, times, obstacle_nodes, obstacle_faces, held, held_times and held_nodes. A second recording has
+    nodes_1 and so on."""
     path = Path(folder) / f"{name}.json"
     arrays: dict[str, Any] = {}
     for index, motion in enumerate(result.motions):
@@ -276,13 +274,13 @@ def write_fit(folder: Path, name: str, result: FitResult) -> Path:
 
 
 def read_motion(path: Path, index: int = 0) -> FittedMotion:
-    """One motion of a fit's NPZ.
+    """Read one motion from a fit's NPZ file.
 
     Args:
-        index: of the recording.
+        index: index of the recording.
 
     Raises:
-        ConfigError: missing, damaged, or another file.
+        ConfigError: the file is missing, damaged, or not a motion.
     """
     keys = (
         "nodes", "start_nodes", "faces", "times", "obstacle_nodes", "obstacle_faces", "held", "held_times", "held_nodes",
@@ -296,9 +294,10 @@ def read_motion(path: Path, index: int = 0) -> FittedMotion:
 
 
 def _check_motion(path: Path, found: Mapping[str, NDArray[Any]]) -> None:
-    """
+    """Check the arrays of a motion file.
+
     Raises:
-        ConfigError: an array of another shape or kind than `FittedMotion` has, or numbers that none of it can be.
+        ConfigError: an array has a wrong shape, type or value.
     """
     frames, held, steps = (found[key].size for key in ("times", "held", "held_times"))
     cloth = found["nodes"].shape[1] if found["nodes"].ndim == 3 else 0
@@ -351,11 +350,11 @@ def _fitted_motion(objective: Objective, run: Rollout, start: Rollout, pose: Ten
 def _as_far_as_both_go(
     objective: Objective, values: Mapping[str, float], start_values: Mapping[str, float]
 ) -> tuple[Rollout, Rollout]:
-    """The rollouts with fitted and first values over the whole scenario, or up to the last frame before one diverges. First
-    values that diverge within the compared frames are replaced by the fitted ones.
+    """Return the rollouts with the fitted and the first values over the whole scenario. If one diverges, both end at
+    the last frame before. If the first values diverge within the compared frames, the fitted ones replace them.
 
     Raises:
-        DivergedError: the fitted ones, within the compared frames.
+        DivergedError: the fitted values diverge within the compared frames.
     """
     run = _as_far_as_it_goes(objective, values, objective.scenario.steps)
     try:
@@ -368,9 +367,10 @@ def _as_far_as_both_go(
 
 
 def _as_far_as_it_goes(objective: Objective, values: Mapping[str, float], steps: int) -> Rollout:
-    """
+    """Return the longest rollout that does not diverge.
+
     Raises:
-        DivergedError: within the compared frames.
+        DivergedError: the motion diverges within the compared frames.
     """
     each = objective.scenario.scene.frame_steps
     while True:
@@ -384,7 +384,7 @@ def _as_far_as_it_goes(objective: Objective, values: Mapping[str, float], steps:
 
 
 def _cut_short(members: Sequence[Objective], runs: Sequence[Rollout], episodes: Sequence[str]) -> list[str]:
-    """What to tell of motions that do not last for the whole scenario."""
+    """Return messages about motions that end before the scenario does."""
     ends = [float(run.times[-1]) for run in runs]
     return [
         f"{name}: the motion is recorded up to {end:.2f} s; after the compared frames it diverges, with the fitted or the "

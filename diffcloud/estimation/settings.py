@@ -1,7 +1,5 @@
-"""Settings of a fit: one field for each, from which options, params.yaml, records and the page of settings are made.
-
-Nothing here imports torch, so that help is quick.
-"""
+"""Settings of a fit. Command options, params.yaml, records and the page of settings are made from these fields. Nothing
+here imports torch, so that `--help` is fast."""
 
 from __future__ import annotations
 
@@ -18,52 +16,53 @@ if TYPE_CHECKING:
     from diffcloud.scene.scenarios import Scenario
 
 LEVEL = 0.9
-"""Of intervals."""
+"""Default probability of the intervals."""
 IDENTIFIED_FACTOR = 2.0
 SMOOTHING = 0.5
-"""Default of adam's."""
+"""Default `smoothing` of adam."""
 _Starts = Annotated[int, Field(ge=1, le=MOST_STARTS)] | None
 
 
 class LikelihoodSolver(Section):
-    """Likeliest parameters and their uncertainty: a variance for each frame, a horizon, a correction by a finer mesh."""
+    """Most likely parameters with intervals. Each frame has its own variance, a horizon limits the frames, and a
+    refined mesh corrects the motion."""
 
     name: Literal["likelihood"] = "likelihood"
     max_steps: Count | None = None
-    """Steps of a start at most. Default: 12."""
+    """Maximum number of steps of a start. Default: 12."""
     starts: _Starts = None
-    """Descents from different places. Default: 3."""
+    """Number of descents, each from another start. Default: 3."""
     model_error: bool = True
     """Whether cloth and simulator may differ. False for recordings that this simulator made on this mesh."""
 
 
 class AdamSolver(Section):
-    """The paper's: descent along the gradient of the loss. It gives no intervals."""
+    """The paper's solver: gradient descent on the loss. It gives no intervals."""
 
     name: Literal["adam"] = "adam"
     max_steps: Count | None = None
-    """Steps at most. Default: 50."""
+    """Maximum number of steps. Default: 50."""
     starts: _Starts = None
-    """Descents from different places. Default: 1."""
+    """Number of descents, each from another start. Default: 1."""
     learning_rate: Positive | None = None
-    """Default: the scenario's."""
+    """Learning rate of Adam. Default: the scenario's."""
     smoothing: NonNegative | None = None
-    """Standard deviation, on the sigmoid's axis, of perturbed copies of the first start, whose gradients are averaged.
+    """Standard deviation, before the sigmoid, of perturbed copies of the first start, whose gradients are averaged.
     Default: 0.5; 0: the plain gradient, as in the paper."""
     resample: bool | None = None
-    """New points in each step, as in the published scripts. Default: the same points."""
+    """Sample new points in each step, as in the published scripts. Default: the same points."""
     threshold: NonNegative | None = None
-    """Loss below which the descent stops. Default: never; of `loss: paper`, the scenario's."""
+    """Loss below which the descent stops. Default: never; with `loss: paper`, the scenario's."""
 
 
 class SearchSolver(Section):
-    """A search without derivatives: CMA-ES, or uniform draws. It gives no intervals."""
+    """A search without derivatives: CMA-ES, or uniform random samples. It gives no intervals."""
 
     name: Literal["cma_es", "random_search"] = "cma_es"
     max_simulations: Count | None = None
-    """Simulations at most. Default: 200."""
+    """Maximum number of simulations. Default: 200."""
     threshold: NonNegative | None = None
-    """Loss below which the search stops. Default: never; of `loss: paper`, the scenario's."""
+    """Loss below which the search stops. Default: never; with `loss: paper`, the scenario's."""
 
 
 _Block = LikelihoodSolver | AdamSolver | SearchSolver
@@ -71,11 +70,11 @@ Solver = Annotated[_Block, Field(discriminator="name")]
 SOLVER_KINDS: dict[str, type[Section]] = {
     name: kind for kind in get_args(_Block) for name in get_args(kind.model_fields["name"].annotation)
 }
-"""Name -> its settings."""
+"""Solver name -> settings class."""
 
 
 class FitSettings(Section):
-    """Of a fit."""
+    """Settings of a fit."""
 
     parameters: Names = ["stretching", "density"]
     """Parameters to find, comma-separated, such as stretching,bending,density."""
@@ -86,26 +85,26 @@ class FitSettings(Section):
     solver: Solver = LikelihoodSolver()
     """likelihood, with intervals; adam, the paper's; cma_es or random_search, without derivatives."""
     points: Count | None = None
-    """Points that are sampled on the cloth in each frame. Default: the scene's."""
+    """Number of points sampled on the cloth in each frame. Default: the scene's."""
     frames: Annotated[list[Annotated[int, Field(ge=-100_000, le=100_000)]], Field(min_length=1)] | None = None
     """Frames to compare, such as 0,5,10. Default: all usable ones."""
     seed: Seed = 0
-    """Of all random numbers."""
+    """Seed of all random numbers."""
     loss: Literal["surface", "paper"] = "surface"
     """surface: both directions, all frames. paper: from cloth to recording only, squared, at the scene's loss frames."""
     alignment: Name | None = None
-    """Parts of the recording's pose and clock to find, with their standard deviation: x=2cm,yaw=5deg,lag=50ms. Of x, y, z,
-    tilt_x, tilt_y, yaw, lag, scale; or none. Default: all but scale."""
+    """Pose variables to estimate, each with its prior standard deviation: x=2cm,yaw=5deg,lag=50ms. Of x, y, z, tilt_x,
+    tilt_y, yaw, lag, scale; or none. Default: all but scale."""
     initial_state: Name | None = None
-    """How the cloth may lie at first: turn=5deg, shape=5mm, size=2%, track=2%; or none. Default: what the scene says, for
-    likelihood with a smooth integrator."""
+    """Deviations from the initial state to estimate, each with its prior standard deviation: turn=5deg, shape=5mm,
+    size=2%, track=2%; or none. Default: what the scene says, for likelihood with a smooth integrator."""
     prior: Name | None = None
-    """The factor within which each multiplier probably lies, such as bending=3x; or none. Default: 10x."""
+    """Prior standard deviation of each multiplier as a factor, such as bending=3x; or none. Default: 10x."""
     uncertain: Name | None = None
-    """Other material that is fitted too, each within a factor: bending=1.5x,air_density=1.3x; or none. Default: the
-    scene's, for likelihood with a smooth integrator."""
+    """Nuisance material to estimate too, each with its prior standard deviation as a factor:
+    bending=1.5x,air_density=1.3x; or none. Default: the scene's, for likelihood with a smooth integrator."""
     joint: bool = False
-    """One parameter set for all recordings, of one cloth."""
+    """Fit one parameter set to all recordings, of one cloth."""
     level: Level = LEVEL
     """Probability of the intervals."""
     identified_factor: Factor = IDENTIFIED_FACTOR
@@ -114,7 +113,7 @@ class FitSettings(Section):
     @field_validator("solver", mode="before")
     @classmethod
     def _named(cls, solver: Any) -> Any:
-        """A name alone stands for that solver with its defaults."""
+        """Replace a solver's name by its default settings."""
         if isinstance(solver, str):
             solver = {"name": solver}
         if not isinstance(solver, dict):
@@ -127,7 +126,7 @@ class FitSettings(Section):
     @field_validator("bounds", "fixed", mode="before")
     @classmethod
     def _given(cls, values: Any) -> Any:
-        """null stands for a parameter that has none of its own."""
+        """Drop entries that are null, so that the default applies."""
         return {name: value for name, value in values.items() if value is not None} if isinstance(values, dict) else values
 
     @model_validator(mode="after")
@@ -159,14 +158,14 @@ class FitSettings(Section):
         return self.loss == "paper"
 
     def measure(self) -> dict[str, Any]:
-        """Keyword arguments of `Objective`."""
+        """Return the keyword arguments of `Objective`."""
         from diffcloud.estimation.pose import parse_priors
 
         priors = None if self.alignment is None else parse_priors(self.alignment)
         return {"paper": self.paper, "nuisance": priors, "frames": self.frames, "points": self.points, "seed": self.seed}
 
     def known_within(self, scenarios: Sequence[Scenario]) -> dict[str, float]:
-        """Material that is not known exactly in a fit of recordings in these scenarios -> factor of one deviation."""
+        """Return the uncertain material of a fit in these scenarios -> standard deviation as a factor."""
         from diffcloud.estimation.uncertain import MATERIAL_UNCERTAINTY
         from diffcloud.scene.scenarios.uncertain import parse_uncertain
 
@@ -184,8 +183,8 @@ class FitSettings(Section):
         }
 
     def initial_state_within(self, scenarios: Sequence[Scenario]) -> list[dict[str, float]]:
-        """How the cloth may lie otherwise at the start of each recording, in one fit of recordings in these scenarios: name
-        of `estimation.initial_state` -> standard deviation [rad, m, 1]."""
+        """Return the initial-state variables of each recording in one fit: name -> standard deviation [rad, m, 1].
+        `estimation.initial_state` explains the names."""
 
         from diffcloud.scene.scenarios.initial_state import parse_initial_state
 
@@ -194,14 +193,14 @@ class FitSettings(Section):
         return [dict(one.initial_state) if self._fits_more(scenarios) else {} for one in scenarios]
 
     def _fits_more(self, scenarios: Sequence[Scenario]) -> bool:
-        """Whether nuisance variables are fitted by default: where derivatives make that cheap."""
+        """Return whether nuisance variables are fitted by default, i.e. whether derivatives make them cheap."""
         from diffcloud.sim.integrators import load_integrator
 
         smooth = all(load_integrator(one.scene.integrator).smooth for one in scenarios)
         return self.solver.name == "likelihood" and smooth
 
     def solver_settings(self, scenario: Scenario) -> Settings:
-        """Of the solver, with what the scenario says where nothing is given."""
+        """Return the solver's settings, with the scenario's values as defaults."""
         from diffcloud.estimation.solvers import SOLVERS
 
         given: dict[str, Any] = {"seed": self.seed}

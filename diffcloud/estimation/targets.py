@@ -1,4 +1,4 @@
-"""One episode as the loss takes it: which frames, which points, and the gripper's track."""
+"""One episode prepared for the loss: compared frames, weighted points, camera views and the gripper track."""
 
 from __future__ import annotations
 
@@ -18,76 +18,76 @@ from diffcloud.sim.simulate import rollout
 from diffcloud.sim.system import System
 
 _CUT_M = 0.002
-"""If the lowest points lie so far above the lowest node of the cloth at its start, the recording was cut there."""
+"""The recording counts as cropped if its lowest points are this far [m] above the lowest initial cloth node."""
 _LOWEST = 0.005
-"""Part of the recorded points that may lie below the cut: noise."""
+"""Fraction of the recorded points that noise may move below the crop height."""
 _USABLE, _NEARLY, _TOO_LITTLE = 0.5, 0.8, 0.05
-"""Part of the cloth above the cut in a frame that counts; where no frame has it, this part of the most that any has; and
-what is too little in any case."""
+"""A frame is usable if the first fraction of the cloth is above the crop height. If no frame reaches it, the second
+value times the largest fraction is required. The third value is the minimum in any case."""
 _MOST = 30
-"""Usable frames that are compared where none are named: neighbours in a quick recording say nearly the same."""
+"""Maximum number of frames that are compared by default. More frames of a fast recording add little information."""
 _OUT_OF_REACH = 1e9
 _UNSURE_M = 0.005
-"""A recorded point whose depth is so uncertain counts half."""
+"""A recorded point with this standard deviation of its depth [m] gets half the weight."""
 
 
 @dataclass(frozen=True)
 class LostPixels:
-    """Where one camera could not have seen the cloth: in lost pixels, and in those beside them, which show a place that is
-    half lost. (In a lift with the right parameters, the one point in eighty that lay there made up half of the loss.)"""
+    """Invalid-pixel masks of one camera. Neighbours of invalid pixels are masked too, since they may see the cloth only
+    partly. (In a lift with the true parameters, the few points beside invalid pixels caused half of the loss.)"""
 
     T_camera_scene: Tensor
-    """[3, 4]"""
+    """[3, 4] transform from the scene to the camera."""
     lens: Tensor
-    """[2, 2] (fx, fy) and (cx, cy)."""
+    """[2, 2] focal lengths (fx, fy) and principal point (cx, cy) [px]."""
     pixels: Tensor
-    """bool [L, H, W]"""
+    """bool [L, H, W], True if a pixel is invalid or beside an invalid one."""
 
     def blind(self, points: Tensor) -> Tensor:
-        """bool [B, L, N] of points [B, L, N, 3] in the recording's frame: behind the camera, beside its image, or in a lost
-        pixel."""
+        """Return which points [B, L, N, 3] of the recording's frame the camera cannot record, bool [B, L, N]: behind
+        the camera, outside the image, or at a masked pixel."""
         frames, height, width = self.pixels.shape
         x, y, z = (points @ self.T_camera_scene[:, :3].T + self.T_camera_scene[:, 3]).unbind(-1)
         (fx, fy), (cx, cy) = self.lens.tolist()
         depth = z.clamp(min=1e-9)
         column, row = (fx * x / depth + cx).round(), (fy * y / depth + cy).round()
-        inside = (z > 0) & (column >= 0) & (column < width) & (row >= 0) & (row < height)  # no number is not inside
+        inside = (z > 0) & (column >= 0) & (column < width) & (row >= 0) & (row < height)  # False for NaN
         place = torch.where(inside, row * width + column, 0.0).long() + torch.arange(frames)[:, None] * height * width
         return ~inside | self.pixels.flatten()[place]
 
 
 @dataclass(frozen=True)
 class Target:
-    """One episode in the loss; L frames."""
+    """One episode prepared for the loss, with L frames."""
 
     frames: tuple[int, ...]
-    """[L] numbers of the episode's frames."""
+    """[L] frame numbers in the episode."""
     times: Tensor
-    """[L] [s]"""
+    """[L] times [s]."""
     clouds: tuple[NeighbourIndex, ...]
-    """[L] of all cameras."""
+    """[L] points of all cameras."""
     views: tuple[tuple[NeighbourIndex, ...], ...]
-    """[C][L] what was recorded by each clock of `space`; where that is nothing, a point out of reach."""
+    """[C][L] points of each clock of `space`. A single distant point stands for an empty cloud."""
     sure: tuple[tuple[Tensor, ...], ...]
-    """[C][L] how much each of its points counts; nothing where it recorded nothing."""
+    """[C][L] weights of these points; zero for an empty cloud."""
     cut: float | None
-    """Height below which nothing was recorded."""
+    """Height below which the recording was cropped."""
     viewpoints: Tensor | None
-    """[cameras, 3], in the recording's frame; None where they are not known."""
+    """[cameras, 3] positions of the cameras in the recording's frame; None if unknown."""
     lost: tuple[LostPixels, ...]
-    """What each of these cameras lost; empty where that is not known."""
+    """Invalid-pixel mask of each camera; empty if unknown."""
     planes: Tensor | None
-    """[cameras, 4] (a, b, c, d) in the recording's frame: each camera's points with a x + b y + c z < d were removed; None
-    where nothing was."""
+    """[cameras, 4] crop planes (a, b, c, d) in the recording's frame, or None without crop. Each camera's points with a
+    x + b y + c z < d were removed."""
     watching: tuple[list[int], ...]
-    """[C] which of these cameras go by each clock."""
+    """[C] indices of the cameras that use each clock."""
     space: PoseSpace
     track: Tensor | None
-    """[1, S, G, 3] displacement of the grippers."""
+    """[1, S, G, 3] gripper displacements."""
 
     def blind(self, cameras: Sequence[int], points: Tensor) -> Tensor | None:
-        """bool [B, L, N, C] which of these cameras could not have recorded points [B, L, N, 3] in the recording's frame,
-        whatever stands before them; None if that is not known."""
+        """Return which of these cameras cannot record points [B, L, N, 3] of the recording's frame, bool [B, L, N, C].
+        Occlusion is not considered. The result is None if masks and crop planes are unknown."""
         if not self.lost and self.planes is None:
             return None
         found = torch.zeros(*points.shape[:-1], len(cameras), dtype=torch.bool)
@@ -102,7 +102,7 @@ class Target:
         """Return this target with a subset of its frames, chosen by their indices 0..L-1."""
         chosen = list(chosen)
         first = chosen == list(range(len(chosen)))
-        index = slice(len(chosen)) if first else chosen  # a slice is a view: lost pixels are many to copy
+        index = slice(len(chosen)) if first else chosen  # a slice is a view, which avoids a copy of the large masks
         return replace(
             self,
             frames=tuple(self.frames[one] for one in chosen),
@@ -123,18 +123,17 @@ def read_target(
     whole: bool,
     nuisance: Mapping[str, float],
 ) -> Target:
-    """
+    """Prepare an episode for the loss.
+
     Args:
-        named: frames to compare, negative ones counted from the end; None for every usable one.
-        whole: whether all of a recording counts; else it is looked for a height below which nothing was recorded, and for
-            where the cameras stood and when they looked.
-        nuisance: variables of the pose with the deviations of their priors [m, rad, s].
+        named: frames to compare, negative numbers count from the end; None for all usable frames.
+        whole: use all simulated points, without crop height, camera positions and clocks (loss of the paper).
+        nuisance: pose variables -> standard deviation of the prior [m, rad, s].
 
     Raises:
-        EpisodeError: a frame that the episode lacks, one after the end of the simulation, none that is usable, other
-            grippers than the scene's, viewpoints that are no positions, cut planes that are no planes, or clocks of other
-            cameras.
-        ConfigError: an unknown variable of the pose.
+        EpisodeError: a frame is missing or after the end of the simulation, no frame is usable, the grippers differ
+            from the scene's, or viewpoints, crop planes or clocks are invalid.
+        ConfigError: a pose variable is unknown.
     """
     unit = scenario.length_unit_m
     clocks = ONE_CLOCK if whole else clocks_of(episode)
@@ -154,7 +153,7 @@ def read_target(
     if clocks is not ONE_CLOCK:
         views, sure = map(list, zip(*(_of_camera(episode, frames, camera) for camera in range(len(clocks))), strict=True))
         watching = _watching(episode)
-    centre = torch.as_tensor(episode.points.mean(0, dtype=np.float64))  # of all frames, so that a pose holds for others too
+    centre = torch.as_tensor(episode.points.mean(0, dtype=np.float64))  # independent of the chosen frames
     return Target(
         tuple(frames),
         torch.as_tensor(episode.times[frames], dtype=torch.float64),
@@ -174,7 +173,7 @@ def read_target(
 def _of_camera(
     episode: Episode, frames: Sequence[int], camera: int
 ) -> tuple[tuple[NeighbourIndex, ...], tuple[Tensor, ...]]:
-    """What one camera recorded in each frame, and how much each of its points counts."""
+    """Return the points of one camera in each frame, and their weights."""
     assert episode.camera is not None
     views, sure = [], []
     for frame in frames:
@@ -186,9 +185,10 @@ def _of_camera(
 
 
 def _watching(episode: Episode) -> list[list[int]]:
-    """
+    """Return the indices of the cameras that use each clock.
+
     Raises:
-        EpisodeError: a camera whose place is known, but whose clock is not, or the reverse.
+        EpisodeError: a camera has a position but no clock, or the reverse.
     """
     standing = list(episode.viewpoints)
     if standing and set(standing) != set(episode.clocks):
@@ -200,9 +200,10 @@ def _watching(episode: Episode) -> list[list[int]]:
 
 
 def _lost(episode: Episode, frames: Sequence[int]) -> tuple[LostPixels, ...]:
-    """
+    """Return the invalid-pixel mask of each camera.
+
     Raises:
-        EpisodeError: the cameras that lost something are not those whose places are known.
+        EpisodeError: the cameras with masks differ from those with known positions.
     """
     if episode.lost is None:
         return ()
@@ -223,26 +224,26 @@ def _lost(episode: Episode, frames: Sequence[int]) -> tuple[LostPixels, ...]:
 
 
 def _planes(episode: Episode) -> Tensor | None:
-    """Of the cameras whose places are known; of one whose points were not cut, zeros, which cut nothing."""
+    """Return the crop planes of the cameras with known positions. A plane of zeros stands for no crop."""
     planes = episode.cut_planes
     found = [planes.get(name, np.zeros(4)) for name in episode.viewpoints]
     return torch.from_numpy(np.stack(found)) if planes and found else None
 
 
 def _widened(pixels: Tensor) -> Tensor:
-    """bool [L, H, W] by one pixel to all sides."""
+    """Dilate masks, bool [L, H, W], by one pixel to all sides."""
     return torch.nn.functional.max_pool2d(pixels[:, None].float(), 3, stride=1, padding=1)[:, 0] > 0
 
 
 def _spread(frames: list[int]) -> list[int]:
-    """As many as are compared, evenly spread, the last among them."""
+    """Choose at most `_MOST` frames, evenly spread, including the last."""
     if len(frames) <= _MOST:
         return frames
     return [frames[index] for index in np.unique(np.linspace(0, len(frames) - 1, _MOST).round().astype(int))]
 
 
 def _end(scenario: Scenario) -> float:
-    """Of what can be compared [s]."""
+    """Return the latest time that can be compared [s]."""
     return scenario.steps * scenario.scene.time_step + 0.5 * scenario.scene.frame_time
 
 
@@ -259,10 +260,12 @@ def _checked(scenario: Scenario, episode: Episode, frame: int) -> int:
 def _usable(
     scenario: Scenario, system: System, episode: Episode, track: Tensor | None, cut: float | None, late: float
 ) -> list[int]:
-    """Frames after the start, within the simulation, with enough of the cloth of nominal material above the cut.
+    """Return the frames within the simulated time that show enough of the cloth above the crop height.
+
+    The fraction of the cloth is computed from a simulation with the nominal material.
 
     Args:
-        late: largest offset of a clock [s].
+        late: largest clock offset [s].
     """
     end = _end(scenario) - max(late, 0.0)
     frames = [index for index, time in enumerate(episode.times) if 0 < time <= end]
@@ -270,7 +273,7 @@ def _usable(
         with torch.no_grad():
             run = rollout(system, scenario.steps, track=track, drop_diverged=True)
         heights = run.at(torch.as_tensor(episode.times[frames]))[0, ..., 2]
-        above = ((heights >= cut) | heights.isnan()).double().mean(-1)  # of a motion that diverges nothing is known
+        above = ((heights >= cut) | heights.isnan()).double().mean(-1)  # NaN after divergence counts as above
         enough = max(min(_USABLE, _NEARLY * float(above.max())), _TOO_LITTLE)
         frames = [frame for frame, part in zip(frames, above.tolist(), strict=True) if part >= enough]
     if not frames:
@@ -285,8 +288,8 @@ def _usable(
 
 
 def _found_cut(system: System, episode: Episode, unit: float) -> float | None:
-    """The height below which nothing was recorded: of the cut planes where each camera has one, at the cloth's middle, else
-    as the points show it."""
+    """Return the height below which the recording was cropped, or None. If each camera has a crop plane, this is the
+    lowest height of the planes at the centre of the cloth. Otherwise the height is estimated from the points."""
     planes = episode.cut_planes
     if planes and planes.keys() >= episode.viewpoints.keys() and all(plane[2] > 0 for plane in planes.values()):
         x, y, _ = system.mesh.nodes.mean(axis=0)
@@ -298,7 +301,7 @@ def _found_cut(system: System, episode: Episode, unit: float) -> float | None:
 
 
 def _sure(episode: Episode, frame: int) -> Tensor:
-    """How much each point of a frame counts, by its `sigma`."""
+    """Return the weight of each point of a frame, from its depth uncertainty `sigma`."""
     begin, end = episode.offsets[frame], episode.offsets[frame + 1]
     if episode.sigma is None:
         return torch.ones(int(end - begin), dtype=torch.float64)
@@ -307,13 +310,14 @@ def _sure(episode: Episode, frame: int) -> Tensor:
 
 
 def track_displacement(episode: Episode, grippers: Sequence[str], steps: int, time_step: float) -> np.ndarray:
-    """[S, G, 3] displacement of the scene's grippers since time zero at the end of each step [m].
+    """Return displacements [S, G, 3] of the scene's grippers since time zero at the end of each step, in the episode's
+    unit.
 
-    A cubic spline through the recorded positions, constant after the last. Recorded positions begin with the motion: a
-    track whose first frame is later than time zero is held at its first position until then.
+    They follow a cubic spline through the recorded positions, and are constant after the last one. If the first frame
+    is later than time zero, the gripper stays at its first position until then.
 
     Raises:
-        EpisodeError: other grippers were recorded than the scene has. (A single one needs no name.)
+        EpisodeError: the recorded grippers differ from the scene's. (A single gripper needs no name.)
     """
     assert episode.gripper is not None
     if len(grippers) == len(episode.grippers) == 1:
@@ -329,6 +333,6 @@ def track_displacement(episode: Episode, grippers: Sequence[str], steps: int, ti
         return np.zeros((steps, len(grippers), 3))
     times, positions = episode.times, episode.gripper[:, recorded]
     at = np.clip(np.cumsum(np.full(steps, time_step)), times[0], times[-1])
-    from scipy.interpolate import CubicSpline  # slow to import, and needed for recorded grippers alone
+    from scipy.interpolate import CubicSpline  # slow to import
 
     return np.asarray(CubicSpline(times, positions)(at) - positions[0])

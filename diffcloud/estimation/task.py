@@ -1,4 +1,4 @@
-"""One fit of one or several recordings of a cloth, from its settings to its result. Commands and the library run it."""
+"""One fit of one or several recordings of a cloth, from its settings to its result."""
 
 from __future__ import annotations
 
@@ -34,10 +34,10 @@ class Recording:
 
 
 def compared(record: FitRecord, recordings: Sequence[Recording]) -> AnyObjective:
-    """What a fit has minimised, at the frames that it began with.
+    """Return the objective that a recorded fit minimised, at its initial frames.
 
     Args:
-        recordings: of the fit, in their order.
+        recordings: recordings of the fit, in the same order.
 
     Raises:
         ConfigError, EpisodeError: the episodes lack these frames, or are of different cloths.
@@ -48,30 +48,31 @@ def compared(record: FitRecord, recordings: Sequence[Recording]) -> AnyObjective
 
 
 def _joined(members: Sequence[Objective]) -> AnyObjective:
-    """One recording's objective is that of a fit, several are a joint one's."""
+    """Return the objective of a single recording, or the joint objective of several."""
     return members[0] if len(members) == 1 else JointObjective(members)
 
 
 @dataclass(frozen=True)
 class FitTask:
-    """One parameter set for one or several recordings."""
+    """Fit of one parameter set to one or several recordings."""
 
     recordings: Sequence[Recording]
     settings: FitSettings = field(default_factory=FitSettings)
     init: Mapping[str, float] = field(default_factory=dict)
-    """Multipliers of the first start; the middle of the range where not given."""
+    """Multipliers of the first start; by default the centre of the range."""
 
     @property
     def scenario(self) -> Scenario:
-        """Of the first recording."""
+        """Scenario of the first recording."""
         return self.recordings[0].scenario
 
     @cached_property
     def space(self) -> FitSpace:
-        """
+        """The fitted variables.
+
         Raises:
-            ConfigError: bounds, priors, uncertain material or fixed values that do not fit the parameters, or an initial
-                state that the recordings have none of.
+            ConfigError: bounds, priors, uncertain material or fixed values are invalid for these parameters, or the
+                scenes do not support the requested initial state.
         """
         settings = self.settings
         for recording in self.recordings:
@@ -87,17 +88,19 @@ class FitTask:
         return with_initial_state(space, settings.initial_state_within(scenarios), scenarios)
 
     def objective(self) -> AnyObjective:
-        """
+        """Build the objective.
+
         Raises:
-            ConfigError, EpisodeError: the episodes lack the frames of the loss, an unknown frame, or different cloths.
+            ConfigError, EpisodeError: an episode lacks a requested frame, or the recordings are of different cloths.
         """
         measure = self.settings.measure()
         return _joined([Objective(one.scenario, one.episode, **measure) for one in self.recordings])
 
     def check(self) -> None:
-        """
+        """Check settings and recordings without simulating.
+
         Raises:
-            ConfigError, EpisodeError: as of `space` and `objective`.
+            ConfigError, EpisodeError: see `space` and `objective`.
         """
         _ = self.space
         self.objective()
@@ -107,29 +110,29 @@ class FitTask:
         return replace(self.settings.solver_settings(self.scenario), init=self.init)
 
     def solved(self, progress: Callable[[Progress], None] | None = None) -> tuple[AnyObjective, FitOutcome]:
-        """The fit, of which nothing is written, and what it minimised.
+        """Run the solver. Return the objective and the outcome; nothing is written.
 
         Raises:
-            ConfigError, EpisodeError: as of `space` and `objective`.
-            DivergedError, KeyboardInterrupt: as of `solve`.
+            ConfigError, EpisodeError: see `space` and `objective`.
+            DivergedError, KeyboardInterrupt: see `solve`.
         """
         objective = self.objective()
         outcome = solve(objective, self.space, self.solver_settings, progress=progress)
-        if outcome.estimate is not None:  # frames beyond the horizon said nothing
+        if outcome.estimate is not None:  # frames beyond the horizon were not used
             objective = _joined(outcome.estimate.members)
         return objective, outcome
 
     def fitted(self, progress: Callable[[Progress], None] | None = None, left_out: Tell | None = None) -> FitResult:
-        """The fit with all that is told of it. Ctrl-C ends it, and the best so far is returned, with that reason.
+        """Run the fit and return its full result. Ctrl-C ends the fit, and the best result so far is returned.
 
         Args:
-            progress: of the fit.
-            left_out: of the predictions of each recording from the others.
+            progress: callback for the fit.
+            left_out: callback for the leave-one-out fits.
 
         Raises:
-            ConfigError, EpisodeError: as of `space` and `objective`.
+            ConfigError, EpisodeError: see `space` and `objective`.
             DivergedError: every start diverged.
-            KeyboardInterrupt: before a first loss, or a second time while the result is described.
+            KeyboardInterrupt: Ctrl-C before the first loss, or a second Ctrl-C while the result is prepared.
         """
         space, settings = self.space, self.solver_settings
         objective, outcome = self.solved(progress)
@@ -144,7 +147,7 @@ class FitTask:
         names = [one.name for one in self.recordings]
         try:
             result = describe_fit(objective, space, settings, outcome, episodes=names)
-        except KeyboardInterrupt:  # a fit that may have taken minutes is not given away for the second that this takes
+        except KeyboardInterrupt:  # finish the description, which takes about a second, to keep a fit of minutes
             result = replace(describe_fit(objective, space, settings, outcome, episodes=names), pressed=True)
         record = result.record
         record.failures += failures
@@ -154,10 +157,10 @@ class FitTask:
         return result
 
     def begun(self) -> FitResult:
-        """The place where the fit begins, as a fit that was interrupted there.
+        """Return the start point as a result, in the form of a fit that was interrupted there.
 
         Raises:
-            DivergedError: the motion diverges there.
+            DivergedError: the motion diverges at the start point.
         """
         objective, space, settings, began = self.objective(), self.space, self.solver_settings, time.perf_counter()
         values = space.starts(1, seed=settings.seed, first=self.init)[0].double()

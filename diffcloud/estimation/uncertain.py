@@ -1,9 +1,9 @@
-"""Nuisance material: parameters that are no results, and that are known only within a factor.
+"""Uncertain material: nuisance parameters that are known only within a factor and are not reported.
 
-A fit of stretching and density takes shear, compression, bending, drag, damping and friction from the scene. None of them
-is known exactly, and a hinge twice as stiff as stated moves the cloth by more than the cameras' noise: the fitted
-numbers are bent until they make up for it. So such material is fitted too, each part under a prior about what is known
-of it. It is not a result: a fit reports only the requested parameters, with such material allowed for.
+A fit of stretching and density takes shear, compression, bending, drag, damping and friction from the scene. None of
+them is known exactly. A bending stiffness that is wrong by a factor of two moves the cloth by more than the camera
+noise, so it biases the fitted parameters. Such parameters are therefore fitted too, each under its own prior. Only the
+requested parameters are results.
 """
 
 from __future__ import annotations
@@ -25,20 +25,22 @@ MATERIAL_UNCERTAINTY = {
     "friction": 1.3,
     "self_friction": 1.3,
 }
-"""One standard deviation of each material, as a factor."""
+"""Default standard deviation of each material parameter, as a factor."""
 _FARTHEST = 4.0
-"""Bounds, in standard deviations."""
+"""Bounds of the variables, in standard deviations."""
 
 
 def with_uncertain(space: FitSpace, uncertain: Mapping[str, float], scenarios: Sequence[Scenario]) -> FitSpace:
-    """The space with uncertain material appended. Left as it is: what no scenario has, or what several
-    scenarios of a joint fit state differently.
+    """Append uncertain material to a space.
+
+    Parameters that no scenario has are skipped, and so are those for which the scenarios of a joint fit have different
+    values.
 
     Args:
-        uncertain: parameter -> factor of one deviation about its given value, or else the scenario's.
+        uncertain: parameter -> standard deviation as a factor, about its fixed value or else the scenario's.
 
     Raises:
-        ConfigError: one is requested.
+        ConfigError: a parameter is also requested.
     """
     variables, fixed = list(space.variables), dict(space.fixed)
     for name, factor in uncertain.items():
@@ -55,6 +57,6 @@ def with_uncertain(space: FitSpace, uncertain: Mapping[str, float], scenarios: S
 
 
 def _stated(scenario: Scenario, name: str, fixed: Mapping[str, float]) -> float:
-    """Of one parameter; zero where the scene has nothing that it acts on."""
+    """Return the fixed or nominal value of a parameter; zero if the scene has nothing that it acts on."""
     value = scenario.value(name)
     return fixed.get(name, value) if value else 0.0

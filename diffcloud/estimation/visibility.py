@@ -1,4 +1,4 @@
-"""How far neighbouring parameter sets drive the cloth apart: what a camera could tell from one another."""
+"""Cloth displacement between neighbouring parameter sets, compared with what a camera can resolve."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ from diffcloud.sim.simulate import rollout
 
 @dataclass(frozen=True)
 class VisibilityMap:
-    """A grid of stretching (rows) x density (columns) multipliers."""
+    """Displacements on a grid of stretching (rows) and density (columns) multipliers."""
 
     grid: NDArray[np.float64]
-    """[n] multipliers of both axes."""
+    """[n] multipliers of both parameters."""
     along_stretching_mm: NDArray[np.float64]
-    """[n - 1, n] RMS node distance between neighbours in stretch [mm]."""
+    """[n - 1, n] RMS node distance between neighbours in stretching [mm]."""
     along_density_mm: NDArray[np.float64]
-    """[n, n - 1]"""
+    """[n, n - 1] RMS node distance between neighbours in density [mm]."""
 
     def visible_fraction(self, noise_mm: float) -> float:
-        """Part of all neighbouring pairs that differ by more than the noise."""
+        """Return the fraction of neighbouring pairs that differ by more than the noise."""
         pairs = np.concatenate([self.along_stretching_mm.ravel(), self.along_density_mm.ravel()])
         return float((pairs > noise_mm).mean())
 
@@ -35,13 +35,17 @@ class VisibilityMap:
 def visibility_map(
     scenario: Scenario, *, episode: Episode | None = None, size: int = 5, linear: bool = False
 ) -> VisibilityMap:
-    """Simulate the grid over the bounds [0.1, 10]² and compare neighbours.
+    """Simulate a grid of multipliers from 0.1 to 10 and compare neighbouring motions.
 
-    Only nodes of the loss surface count: at the first loss frame of the scenario's own motion, or over all frames of the
-    motion that an episode's gripper made.
+    Only nodes of the loss surface are compared. Without an episode, the first loss frame of the scenario's own motion
+    is used. With an episode, all frames of the motion with its gripper track are used.
+
+    Args:
+        size: number of grid points along each axis.
+        linear: space the multipliers linearly instead of logarithmically.
 
     Raises:
-        EpisodeError: an episode without a gripper track.
+        EpisodeError: the episode has no gripper track.
     """
     grid = np.linspace(0.1, 10, size) if linear else np.logspace(-1, 1, size)
     stretch, mass = (torch.as_tensor(axis.ravel()) for axis in np.meshgrid(grid, grid, indexing="ij"))

@@ -1,4 +1,4 @@
-"""Comparing methods on equal terms, and what can be known of the parameters."""
+"""Comparison of methods under equal conditions, and intervals of the parameters."""
 
 from diffcloud.evaluation.episode import BASELINES, ComparisonSettings, EpisodeRecord, compare_episode
 from diffcloud.evaluation.intervals import Intervals, intervals_of

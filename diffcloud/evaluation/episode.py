@@ -1,4 +1,4 @@
-"""Everything the comparison says of one episode: methods, gaps, transfer, intervals, landscape."""
+"""Comparison of all methods on one episode: metrics, missing methods, transfer, intervals, loss landscape."""
 
 from __future__ import annotations
 
@@ -26,29 +26,29 @@ BASELINES: tuple[Baseline, ...] = ("single_start", "middle", "random_search", "c
 
 @dataclass(frozen=True)
 class ComparisonSettings:
-    """Of `compare_episode`."""
+    """Settings of `compare_episode`."""
 
     baselines: Sequence[Baseline] = BASELINES
     draws: int = 4
-    """Fresh point samples that losses are averaged over."""
+    """Number of new point samples over which losses are averaged."""
     seed: int = 1000
-    """Of the first of them; searches use it too."""
+    """Seed of the first sample, and of the searches."""
     level: float | None = LEVEL
-    """Of intervals; None: state none."""
+    """Probability of the intervals; None: no intervals."""
     within: float = IDENTIFIED_FACTOR
     """Factor within which a parameter counts as identified."""
     landscape_size: int = 0
-    """Places along each axis of the loss landscape; 0: none."""
+    """Number of points along each axis of the loss landscape; 0: none."""
 
 
 @dataclass(frozen=True)
 class EpisodeRecord:
-    """What was found."""
+    """Result of the comparison on one episode."""
 
     record: dict[str, Any]
-    """Plain values, the same for the same inputs: scenario, episode, its fit, labels, `start` (metrics of the fit's start,
-    None if that diverges), `methods` (a row each: values, clipped values, metrics, simulations), `gaps`, `transfers`,
-    `intervals`, `landscape`, and `nuisance`: parameters that were fitted too, and are not results."""
+    """Plain values, which depend on the inputs only: scenario, episode, its fit and labels, `gaps`, `transfers`,
+    `intervals`, `landscape`. `start` has the metrics of the fit's start, or None if it diverges. `methods` has one row
+    each: values, clipped values, metrics, simulations. `nuisance` names the nuisance parameters."""
     seconds: dict[str, dict[str, float]]
     """Method -> phase -> wall time."""
 
@@ -68,17 +68,17 @@ def compare_episode(
     """Compare all methods on one episode.
 
     Args:
-        fit: of the episode; its measure, bounds, given parameters and number of iterations hold for every method.
-        fit_name: of the fit, if it is another than the episode's: a joint fit has several episodes.
-        recording: the episode's place among those of the fit.
-        predictions: of networks, and why those that should be there are not.
-        transfers: episode -> parameters fitted on it, of other recordings of the same fabric.
+        fit: fit of the episode. Its loss, bounds, fixed parameters and number of iterations apply to every method.
+        fit_name: name of the fit, if it is a joint fit of several episodes.
+        recording: index of the episode in the fit.
+        predictions: predictions of networks, and reasons for missing ones.
+        transfers: other recording of the same fabric -> parameters fitted to it.
     """
     settings = settings or ComparisonSettings()
     space, _ = methods.space_of(fit).of_recording(recording)
     objective = Objective(scenario, episode, **fit.measured_by(recording))
     told: list[Estimate | Gap] = [methods.fitted(fit, recording)]
-    initial_state = fit.initial_state_in(fit.episodes[recording])  # as the pose, for all methods
+    initial_state = fit.initial_state_in(fit.episodes[recording])  # shared by all methods, like the pose
     lying = FitSpace(space.asked.variables, {**space.asked.fixed, **initial_state})
     told += [_run(baseline, objective, lying, fit, settings.seed) for baseline in settings.baselines]
     told += [*predictions, *methods.published(episode.meta)]
@@ -134,10 +134,10 @@ def compare_episode(
         "intervals": None,
         "landscape": None,
     }
-    if 0 in measured.diverged:  # the fit itself: there is no optimum to look around
+    if 0 in measured.diverged:  # the fit itself diverged
         return EpisodeRecord(record, seconds)
     objective.reseed(fit.measure.seed)
-    alone = len(fit.episodes) == 1  # intervals of a joint fit are of all its recordings together
+    alone = len(fit.episodes) == 1  # intervals of a joint fit belong to all recordings
     if settings.level is not None and alone and fit.estimate is not None:
         told_intervals = intervals_of(fit, space, scenario, level=settings.level, within=settings.within)
         record["intervals"] = told_intervals.model_dump(mode="json")
@@ -147,7 +147,7 @@ def compare_episode(
 
 
 def _run(baseline: Baseline, objective: Objective, space: FitSpace, fit: FitRecord, seed: int) -> Estimate | Gap:
-    """One baseline with the budget of the fit, or of one start of Adam; a gap if its simulations fail."""
+    """Run one baseline with the budget of the fit, or of one start of Adam. Return a gap if its simulations fail."""
     told, by_adam = fit.settings, fit.solver == "adam"
     simulations = int(told["max_steps"] or 0) + 1 if by_adam else methods.simulations_each(fit)
     threshold = float(told.get("threshold") or 0.0)

@@ -1,8 +1,8 @@
-"""What a fit says of the parameters: intervals with a level, a status for each, and what to improve first.
+"""Intervals of the fitted parameters, a status for each, and the largest sources of uncertainty.
 
-The covariance is the one that `estimation.likelihood` has found. On the axis of the fit (a factor up and down for
-multipliers) an interval reaches to both sides as far as the variance's root times the quantile of the normal distribution.
-Intervals end at the bounds.
+The covariance comes from `estimation.likelihood`. In fit coordinates (logarithms for multipliers), an interval is
+symmetric. Its half-width is the standard deviation times the quantile of the normal distribution. Intervals end at the
+bounds.
 """
 
 from __future__ import annotations
@@ -40,20 +40,20 @@ ParameterStatus = Literal[
     "model_error",
 ]
 _PLAIN = 1e6
-"""Below it numbers are written out."""
+"""Numbers below this are written without an exponent."""
 FOLLOWS = 4.0
-"""Mean squared distance over what is accounted for, up to which the model follows a recording."""
+"""Maximum ratio of mean squared distance to expected variance for which the model fits a recording."""
 _ENDLESS = 700.0
-"""Largest logarithm of a factor."""
+"""Largest logarithm of a factor, to avoid overflow."""
 _UNFINISHED = "the descent took all its steps before it arrived: give it more with --max-steps"
 _PRIOR = 0.5
-"""Part of the variance from which the prior dominates."""
+"""Fraction of the variance above which a parameter is prior-dominated."""
 _SHARE = 1 / 3
-"""A parameter has its part in a combination from this component on."""
+"""Minimum component of a parameter that belongs to a combination."""
 
 
 def worded(status: str) -> str:
-    """Return a status as people read it: `ratio_only` is "ratio only"."""
+    """Return a status as readable text: `ratio_only` is "ratio only"."""
     return status.replace("_", " ")
 
 
@@ -62,30 +62,30 @@ class _Model(Plain):
 
 
 class Interval(_Model):
-    """Of one parameter."""
+    """Interval of one parameter."""
 
     value: float
-    """In `unit`, as are both ends."""
+    """Fitted value in `unit`, like both ends."""
     low: float
     high: float
     unit: str
     nominal: float
-    """Value of the scene's own material, on which the fit's multiplier acts; 1 where there is no multiplier."""
+    """Value of the scene's own material, to which the multiplier refers; 1 if the parameter has no multiplier."""
     factor: float | None
-    """To its farther end."""
+    """Ratio of the value and the farther end, at least 1."""
     at_bounds: list[float]
-    """Bounds at which it ends: it is one-sided there."""
+    """Bounds at which the interval ends; it is one-sided there."""
     status: ParameterStatus
 
 
 class RatioInterval(_Model):
-    """Of stretching to density [m²/s²]."""
+    """Interval of the ratio of stretching to density [m²/s²]."""
 
     value: float
     low: float
     high: float
     nominal: float
-    """Of the scene's own material."""
+    """Ratio of the scene's own material."""
     factor: float
 
 
@@ -100,66 +100,66 @@ class Combination(_Model):
 
 
 class Intervals(_Model):
-    """Of one fit."""
+    """Intervals of one fit."""
 
     level: float
     within: float
     parameters: dict[str, Interval]
     ratio: RatioInterval | None
     best: Combination | None
-    """The best-determined combination, of several parameters."""
+    """Best-determined combination; None for a single parameter."""
     worst: Combination | None
     sources: dict[str, dict[str, float]]
-    """Where the uncertainty comes from, the largest part first -> parameter (or `ratio`) -> standard deviation, of the
-    logarithm, or of the part of the range where the lower bound is zero."""
+    """Source of uncertainty, the largest first -> parameter (or `ratio`) -> standard deviation in fit coordinates.
+    These are logarithms, or fractions of the range if the lower bound is zero."""
     covariance: list[list[float]]
     fits_to_noise: bool
-    """Whether the model follows every recording for most of what counts."""
+    """Whether the model fits every recording to within noise in most of the used frames."""
     reason: str
-    """Why the status is not of the parameters; else empty."""
+    """Why the model does not fit; else empty."""
     warning: str = ""
-    """Why intervals may be wrong all the same; else empty."""
+    """Why the intervals may still be wrong; else empty."""
     note: str = ""
-    """Why the ratio is not what a motion identifies where the density acts on a part of the cloth; else empty."""
+    """Why the ratio is not an exact invariant if the density acts on a part of the cloth; else empty."""
 
     @property
     def sentences(self) -> list[str]:
-        """Reason, warning and note, for people."""
+        """Reason, warning and note as sentences."""
         return [text[0].upper() + text[1:] + "." for text in (self.reason, self.warning, self.note) if text]
 
 
 @dataclass(frozen=True)
 class _Known:
-    """Of k requested parameters."""
+    """Covariance of k requested parameters."""
 
     sources: Mapping[str, NDArray[np.float64]]
-    """Name -> [k, k] covariance on the axis of the fit."""
+    """Source -> its contribution [k, k] to the covariance, in fit coordinates."""
     quantile: float
-    """Deviations to each side."""
+    """Half-width of an interval in standard deviations."""
 
     @cached_property
     def covariance(self) -> NDArray[np.float64]:
-        """[k, k]"""
+        """[k, k] covariance."""
         return np.sum(list(self.sources.values()), axis=0)
 
     def reach(self, row: NDArray[np.float64]) -> float:
-        """How far the interval of the combination row · places goes to each side."""
+        """Return the half-width of the interval of a linear combination of the coordinates."""
         return self.quantile * math.sqrt(max(float(row @ self.covariance @ row), 0.0))
 
 
 def intervals_of(
     record: FitRecord, space: FitSpace, scenario: Scenario, *, level: float = LEVEL, within: float = IDENTIFIED_FACTOR
 ) -> Intervals:
-    """Of a fit by `likelihood`.
+    """Return the intervals of a fit by `likelihood`.
 
     Args:
-        space: of the fit.
-        scenario: of its first recording.
-        level: of the intervals.
+        space: variables of the fit.
+        scenario: scenario of its first recording.
+        level: probability of the intervals.
         within: factor within which a parameter counts as identified.
 
     Raises:
-        ConfigError: the fit is by another solver, which knows no uncertainty.
+        ConfigError: the fit is by another solver, which has no uncertainty.
     """
     told = record.estimate
     if told is None:
@@ -223,7 +223,7 @@ def stated_parameters(record: FitRecord, found: Intervals | None, scenario: Scen
 
     Args:
         found: intervals of the fit; without them, low, high and status are None.
-        scenario: of the first recording.
+        scenario: scenario of the first recording.
     """
     if found is not None:
         kept = {"value", "unit", "low", "high", "status"}
@@ -241,7 +241,7 @@ def _ratio(values: Mapping[str, float], reach: float, scenario: Scenario) -> Rat
 
 
 def _followed(record: FitRecord) -> tuple[bool, str]:
-    """Whether the model follows every recording for most of what counts, and else why not."""
+    """Return whether the model fits every recording in most of the used frames, and the reason if it does not."""
     assert record.estimate is not None
     for one, told in zip(record.episodes, record.estimate.recordings, strict=True):
         chi_squares = np.array(told.chi_squares)
@@ -255,12 +255,13 @@ def _followed(record: FitRecord) -> tuple[bool, str]:
 
 
 def read_intervals(path: Path, space: FitSpace) -> Intervals:
-    """
+    """Read the intervals of a fit.
+
     Args:
-        space: of the fit whose intervals they are.
+        space: variables of the fit.
 
     Raises:
-        ConfigError: missing, damaged, not intervals, or those of a fit of other parameters.
+        ConfigError: the file is missing or damaged, has no intervals, or belongs to a fit of other parameters.
     """
     try:
         found = Intervals.model_validate(read_json(path, error=ConfigError))
@@ -276,10 +277,10 @@ def read_intervals(path: Path, space: FitSpace) -> Intervals:
 
 
 def draws(found: Intervals, space: FitSpace, count: int, seed: int) -> list[dict[str, float]]:
-    """Return sets of multipliers as probable as the data leave them: normal on the axis of the fit, none beyond its bounds.
+    """Sample sets of multipliers from the estimated distribution: normal in fit coordinates, clipped to the bounds.
 
     Raises:
-        ConfigError: the fit does not follow its recording; then its covariance says nothing.
+        ConfigError: the model does not fit its recording, so the covariance is invalid.
     """
     if found.reason:
         raise ConfigError(f"Nothing can be drawn from these intervals: {found.reason}.")
@@ -291,8 +292,8 @@ def draws(found: Intervals, space: FitSpace, count: int, seed: int) -> list[dict
 
 
 def significant(low: float | None, high: float | None) -> Callable[[float | None], str]:
-    """What prints a number with as many digits as its interval bears: two where it is known within some tens of per cent,
-    three within some per cent, and so on; three without an interval."""
+    """Return a function that formats a number with as many digits as its interval justifies. It uses two digits if the
+    number is known within tens of percent, three within a few percent, and so on. Without an interval it uses three."""
     digits = 3
     if low is not None and high is not None and 0 < low < high:
         digits = 2 + min(max(math.floor(-math.log10((high - low) / (high + low))), 0), 4)
@@ -307,7 +308,7 @@ def significant(low: float | None, high: float | None) -> Callable[[float | None
 
 
 def _node_set_note(scenario: Scenario) -> str:
-    """See `Intervals.note`."""
+    """Return `Intervals.note`."""
     nodes = scenario.node_sets.get("density")
     if nodes is None:
         return ""
@@ -315,7 +316,7 @@ def _node_set_note(scenario: Scenario) -> str:
 
 
 def _ends(space: FitSpace, index: int, value: float, reach: float) -> tuple[float, float, list[float]]:
-    """The interval of one parameter, and the bounds at which it ends."""
+    """Return the interval of one parameter, and the bounds at which it ends."""
     variable, axis = space.variables[index], Axis.of(space)
     values = torch.tensor([[v.low for v in space.variables]] * 3, dtype=torch.float64)
     values[:, index] = value
@@ -339,7 +340,7 @@ def _ratio_row(space: FitSpace) -> NDArray[np.float64] | None:
 
 
 def _combinations(found: _Known, space: FitSpace) -> list[Combination]:
-    """Principal axes of the covariance, the best-determined first."""
+    """Return the principal axes of the covariance, the best-determined first."""
     told = []
     for direction in np.linalg.eigh(found.covariance)[1].T:
         powers = direction / direction[np.abs(direction).argmax()]
@@ -353,7 +354,7 @@ def _combinations(found: _Known, space: FitSpace) -> list[Combination]:
 
 
 def _tied(combination: Combination, space: FitSpace) -> set[str]:
-    """The parameters whose product a combination is: none where it is one alone, or where one has no logarithm."""
+    """Return the parameters of a combination; empty for a single parameter, or if a parameter has no logarithm."""
     named = [one for one in space.variables if abs(combination.powers[one.name]) > _SHARE]
     return {one.name for one in named} if len(named) > 1 and all(one.low > 0 for one in named) else set()
 

@@ -1,4 +1,4 @@
-"""The loss over two parameters, simulated on a grid in batches, and the optimiser's path on it."""
+"""Loss over two parameters on a grid, and the optimiser's path."""
 
 from __future__ import annotations
 
@@ -17,16 +17,18 @@ from diffcloud.estimation.record import History
 def loss_landscape(
     objective: Objective, space: FitSpace, values: Mapping[str, float], history: History, *, size: int
 ) -> dict[str, Any] | None:
-    """Losses over the first two requested parameters, the others as fitted.
+    """Return the losses over the first two requested parameters, with the others as fitted.
 
     Args:
-        values: the fitted ones.
-        history: of the fit.
-        size: n places along each axis, between the bounds: at equal ratios, or at equal distances from a bound of zero.
+        values: fitted values.
+        history: history of the fit.
+        size: number n of points along each axis between the bounds, at equal ratios, or equal distances if a bound is
+            zero.
 
     Returns:
-        names; x, y: [n] of the first and the second parameter; loss: [n][n], rows of y, None where a run diverged; paths:
-        for each start that was followed [iterations][2]; fitted: [2]. None if fewer than two are requested.
+        names; x, y: [n] values of the first and the second parameter; loss: [n][n] with rows of y, None if a run
+            diverged; paths: [iterations][2] for each start; fitted: [2]. None if fewer than two parameters are
+            requested.
     """
     if len(space.asked.variables) < 2:
         return None

@@ -1,4 +1,4 @@
-"""The comparison as a Markdown page, for documentation."""
+"""The comparison as a Markdown page for the documentation."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from diffcloud.evaluation.summary import Tables, label, sentences
 
 
 def comparison_page(told: Tables, missing: Sequence[str], title: str) -> str:
-    """Sentences first, then tables: losses per episode, means per method, seconds, intervals, repeats.
+    """Return the page: sentences first, then tables of losses, means, wall times, intervals and repeats.
 
     Args:
-        told: of `summary.tables`.
-        missing: what should be there and is not.
+        told: result of `summary.tables`.
+        missing: missing results that were expected.
     """
     parts = [f"# {title}", "", *(f"- {line}" for lines in sentences(told).values() for line in lines), ""]
     parts += [
@@ -126,7 +126,7 @@ def _table(head: Sequence[str], table: pd.DataFrame) -> list[str]:
 
 
 def markdown_table(head: Sequence[str], rows: Sequence[Sequence[object]]) -> list[str]:
-    """Lines of a Markdown table; a missing value is a dash."""
+    """Return the lines of a Markdown table; a missing value is a dash."""
     lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
     return lines + ["| " + " | ".join(_cell(value) for value in row) + " |" for row in rows]
 

@@ -1,9 +1,8 @@
-"""Methods that name the parameters of an episode, on equal terms.
+"""Methods that estimate the parameters of an episode, under equal conditions.
 
-Each gives one parameter set: the fit, a network's prediction, or a baseline without gradients or learning. Baselines that
-search are the solvers of `estimation.solvers`; they see the objective that the fit sees (frames, points, common random
-numbers, bounds), may simulate as often as the fit (as one start of it, where that was Adam's), and stop below the same
-threshold.
+Each method gives one parameter set: the fit, a network's prediction, or a baseline without gradients or training.
+Baselines that search are solvers of `estimation.solvers`. They use the objective of the fit (frames, sample points,
+bounds) and the same threshold. Their budget is the number of simulations of the fit, or of one start of it with Adam.
 """
 
 from __future__ import annotations
@@ -31,40 +30,40 @@ from diffcloud.estimation.solvers import (
 )
 
 Baseline = Literal["single_start", "middle", "random_search", "cma_es"]
-"""What the comparison can run by itself."""
+"""Baselines that the comparison runs itself."""
 Phase = Literal["dataset", "training", "inference", "optimisation"]
 PHASES: tuple[Phase, ...] = ("dataset", "training", "inference", "optimisation")
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """What one method says of one episode."""
+    """Result of one method for one episode."""
 
     method: str
     values: Mapping[str, float]
-    """As told by the method; may lie outside the bounds."""
+    """Estimated values, possibly outside the bounds."""
     simulations: int = 0
-    """Runs of the simulator spent on this episode."""
+    """Number of simulator runs for this episode."""
     gradients: bool = False
-    """Whether each of these runs was differentiated too, which costs two to three times as much."""
+    """Whether each run also computed derivatives, which takes two to three times as long."""
     seconds: Mapping[str, float] = field(default_factory=dict)
-    """Phase -> wall time, of those that are known; data set and training serve all episodes of a scenario."""
+    """Phase -> wall time, for known phases. Data set and training are shared by all episodes of a scenario."""
     intervals: Mapping[str, tuple[float, float]] | None = None
-    """Of a method that tells a posterior."""
+    """Intervals, for a method with a posterior."""
 
 
 @dataclass(frozen=True)
 class Gap:
-    """A method that says nothing of an episode."""
+    """A method without a result for an episode."""
 
     method: str
     reason: str
     expected: bool = True
-    """Whether it should have: then the comparison is incomplete."""
+    """Whether a result was expected, so that the comparison is incomplete."""
 
 
 def space_of(fit: FitRecord) -> FitSpace:
-    """The free parameters of a fit with their bounds and priors, and those that were given."""
+    """Return the free variables of a fit with bounds and priors, and the fixed parameters."""
     variables, fixed = [], {}
     for name, entry in fit.parameters.items():
         if entry.bounds is None or entry.centre is None:
@@ -77,7 +76,7 @@ def space_of(fit: FitRecord) -> FitSpace:
 
 
 def fitted(fit: FitRecord, recording: int) -> Estimate:
-    """The fit itself, of one of its recordings, with its share of what all of them took."""
+    """Return the fit as a method for one of its recordings, with its share of the total cost."""
     return Estimate(
         "diffcloud",
         of_recording(fit.simulated, recording),
@@ -88,27 +87,25 @@ def fitted(fit: FitRecord, recording: int) -> Estimate:
 
 
 def simulations_each(fit: FitRecord) -> int:
-    """That a fit took for each of its recordings."""
+    """Return the number of simulations per recording of a fit."""
     return math.ceil(fit.simulations / len(fit.episodes))
 
 
 def middle(space: FitSpace) -> Estimate:
-    """The middle of each range on the paper's linear scale: what no learning and no search gives."""
+    """Return the mid-range baseline: the centre of each range on the paper's linear scale."""
     return Estimate("middle", {variable.name: 0.5 * (variable.low + variable.high) for variable in space.asked.variables})
 
 
 def single_start(objective: Objective, space: FitSpace, settings: AdamSettings) -> Estimate:
-    """The paper's own setting: Adam from the middle, plain gradient, one start."""
+    """Run the paper's own setting: Adam with plain gradients from the mid-range, one start."""
     found = fit_adam(objective, space, replace(settings, starts=1, smoothing=0.0, init={}))
     return _estimate("single_start", found, gradients=True)
 
 
 def first_start(fit: FitRecord, space: FitSpace) -> Estimate | None:
-    """What the paper's setting gives, if it is a part of the fit: its first start, from the middle with plain gradients.
-
-    Starts do not touch one another, so it need not be run again. Its own wall time is not known then. None if the fit was
-    smoothed, began elsewhere, was stopped by another start, or changed its points, or if another solver made it.
-    """
+    """Return the result of the paper's setting if it is part of the fit: its first start, from the mid-range. Starts
+    are independent, so it need not be run again, but its wall time is unknown. None if another solver was used, the fit
+    was smoothed or resampled, began elsewhere, or was stopped by another start."""
     if fit.solver != "adam":
         return None
     settings, history = fit.settings, fit.history
@@ -125,7 +122,7 @@ def first_start(fit: FitRecord, space: FitSpace) -> Estimate | None:
 
 
 def searched(objective: Objective, space: FitSpace, settings: CmaEsSettings | RandomSearchSettings) -> Estimate:
-    """A baseline without gradients: the solver that a fit can have too, under its name.
+    """Run a baseline without gradients.
 
     Raises:
         DivergedError: every candidate diverged.
@@ -134,7 +131,7 @@ def searched(objective: Objective, space: FitSpace, settings: CmaEsSettings | Ra
 
 
 def _estimate(method: str, found: FitOutcome, *, gradients: bool) -> Estimate:
-    found = found.uninterrupted()  # half a search is no method; the fit itself keeps its best so far
+    found = found.uninterrupted()  # an interrupted search is not a valid baseline
     return Estimate(
         method,
         found.values,
@@ -150,18 +147,18 @@ def predicted(
     seconds: Mapping[str, float],
     intervals: Mapping[str, tuple[float, float]] | None = None,
 ) -> Estimate:
-    """A network's prediction."""
+    """Return a network's prediction."""
     return Estimate(method, dict(values), seconds=seconds, intervals=intervals)
 
 
 def published(meta: Mapping[str, Any]) -> list[Estimate]:
-    """Predictions that came with a published episode."""
+    """Return the predictions stored with a published episode."""
     return [Estimate(f"published_{model}", dict(pair)) for model, pair in (meta.get("predictions") or {}).items()]
 
 
 def clipped(values: Mapping[str, float], space: FitSpace) -> dict[str, float]:
-    """Values within the bounds, with the given ones in place; what a method leaves out is the middle, or what is known of
-    uncertain material."""
+    """Return values clipped to the bounds, with the fixed parameters. Missing values are mid-range, or the prior's
+    centre for uncertain material."""
     found = {**middle(space).values, **space.asked.fixed}
     for variable in space.variables:
         value = float(values.get(variable.name, found[variable.name]))

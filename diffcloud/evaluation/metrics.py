@@ -1,4 +1,4 @@
-"""What a parameter set is worth on an episode: distances to the recorded clouds, success, error of known parameters."""
+"""Metrics of a parameter set on an episode: distances to the recorded clouds, success, error of known parameters."""
 
 from __future__ import annotations
 
@@ -16,32 +16,31 @@ from diffcloud.scene.scenarios import PAPER_THRESHOLD, RELEASE_UNIT_M, Scenario
 
 
 def success_threshold(scenario: Scenario) -> float:
-    """The paper's 0.0005 squared release units, in the scenario's squared length unit."""
+    """Return the paper's threshold, 0.0005 squared release units, in the scenario's squared length unit."""
     return PAPER_THRESHOLD * (RELEASE_UNIT_M / scenario.length_unit_m) ** 2
 
 
 @dataclass(frozen=True)
 class Measured:
-    """The metrics of a batch of parameter sets."""
+    """Metrics of a batch of parameter sets."""
 
     rows: list[dict[str, Any]]
-    """Metric -> value of each set, empty where one diverged; see `EpisodeMeter.measure`."""
+    """Metric -> value for each set, empty if it diverged; see `EpisodeMeter.measure`."""
     diverged: dict[int, str]
-    """Set -> message."""
+    """Index of a set -> message."""
 
 
 class EpisodeMeter:
-    """Measures parameter sets on one episode, all with the same simulator, frames and sampled points.
-
-    The points are drawn anew: no method has seen them.
-    """
+    """Measures parameter sets on one episode with the same simulator, frames and sample points. The points are newly
+    sampled, so no method was fitted to them."""
 
     def __init__(self, objective: Objective, *, draws: int = 4, seed: int = 1000) -> None:
-        """
+        """Prepare the measurement.
+
         Args:
-            objective: whose measure counts; it stays as it is.
-            draws: of points, over which distances at its frames are averaged.
-            seed: of the first draw.
+            objective: objective whose loss is used; it is not changed.
+            draws: number of point samples over which distances are averaged.
+            seed: seed of the first sample.
         """
         scenario, episode = objective.scenario, objective.episode
         self.scenario, self.episode = scenario, episode
@@ -59,22 +58,22 @@ class EpisodeMeter:
         self._seeds = range(seed, seed + draws)
 
     def measure(self, sets: Sequence[Mapping[str, float]]) -> Measured:
-        """Metrics of parameter sets, each within its bounds.
+        """Return metrics of parameter sets, each within its bounds.
 
-        Returns rows with
-            loss, loss_deviation: by the fit's measure at its frames [squared length unit], the mean over the draws and
-                their standard deviation (of one draw);
-            rms_mm: its root in millimetres;
-            loss_other_frames, rms_other_frames_mm: at the frames that the fit did not use, of one draw; absent without any,
-                and where the motion diverges after the fit's frames;
-            two_sided: Chamfer in both directions at the fit's frames, of one draw;
-            and of episodes with known parameters: success, error_<parameter> (relative), error_ratio
-            (stretching over density).
+        Rows have
+            loss, loss_deviation: mean and standard deviation over the samples, at the fit's frames [squared length
+                unit];
+            rms_mm: root mean square distance in millimetres;
+            loss_other_frames, rms_other_frames_mm: at the frames that the fit did not use, for one sample; missing if
+                there are none, or if the motion diverges after the fit's frames;
+            two_sided: Chamfer distance in both directions at the fit's frames, for one sample;
+            success, error_<parameter> (relative), error_ratio (stretching over density): if the true parameters are
+                known.
         """
         with torch.no_grad():
             found, kept, late = without_diverged(len(sets), lambda index: self._distances([sets[i] for i in index]))
             of_all, rest = kept.tolist(), list(late)
-            # what diverges after the fit's own frames is measured at these
+            # sets that diverge after the fit's own frames are measured at these frames only
             at_own, kept, lost = without_diverged(
                 len(rest), lambda index: self._distances([sets[rest[i]] for i in index], others=False)
             )
@@ -85,9 +84,10 @@ class EpisodeMeter:
         return Measured(rows, {rest[index]: message for index, message in lost.items()})
 
     def _distances(self, sets: Sequence[Mapping[str, float]], *, others: bool = True) -> list[dict[str, Any]]:
-        """
+        """Return the distance metrics.
+
         Args:
-            others: at the frames that the fit did not use too.
+            others: include the frames that the fit did not use.
         """
         own = self._own
         names = dict.fromkeys(name for values in sets for name in values)

@@ -1,4 +1,4 @@
-"""What `python -m pipeline.evaluate` leaves for the report, as files hold it: checked before anything is drawn from it."""
+"""Data models of the files that `python -m pipeline.evaluate` writes, to check them before the report uses them."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ Text = Annotated[str, Field(max_length=10_000)]
 
 
 class _Metrics(Plain):
-    """Loss and errors, one for each parameter that has a known truth."""
+    """Loss and errors, one for each parameter with a known true value."""
 
     model_config = ConfigDict(extra="allow")
     __pydantic_extra__: dict[str, Value | None] = Field(init=False)
@@ -30,7 +30,7 @@ class _Metrics(Plain):
 
 
 class MethodRecord(_Metrics):
-    """What one method found, and how good it is."""
+    """Result and metrics of one method."""
 
     method: Text
     values: dict[str, Value]
@@ -39,11 +39,11 @@ class MethodRecord(_Metrics):
     simulations: int | None
     gradients: bool
     intervals: dict[str, tuple[Value, Value]] | None = None
-    """Of a posterior, at the level of the fit's."""
+    """Intervals of a posterior, at the level of the fit's intervals."""
 
 
 class TransferRecord(_Metrics):
-    """Parameters of another recording."""
+    """Metrics of the parameters of another recording."""
 
     source: Text
     clipped: dict[str, Value]
@@ -69,7 +69,7 @@ class LandscapeRecord(Checked):
 
 
 class StatedIntervals(Intervals):
-    """As this version writes them: no field may be missing."""
+    """Intervals as this version writes them, without missing fields."""
 
     level: Annotated[float, Field(gt=0, lt=1)]
     within: Annotated[float, Field(gt=1, le=1e6)]
@@ -78,7 +78,7 @@ class StatedIntervals(Intervals):
 
 
 class ComparisonRecord(Checked):
-    """One episode."""
+    """Comparison on one episode."""
 
     scenario: Text
     episode: Text
@@ -103,7 +103,7 @@ class ComparisonRecord(Checked):
 
 
 class ComparisonFile(Checked):
-    """tables/comparison.json."""
+    """Content of tables/comparison.json."""
 
     records: list[ComparisonRecord]
     failures: list[Text]
@@ -111,7 +111,7 @@ class ComparisonFile(Checked):
 
 
 class FitRow(Plain):
-    """A row of tables/fits.csv. Its other columns are losses, distances, parameters and their truth."""
+    """A row of tables/fits.csv. Its other columns are losses, distances, parameters and their true values."""
 
     model_config = ConfigDict(extra="allow")
     __pydantic_extra__: dict[str, NonNegative] = Field(init=False)
@@ -120,12 +120,12 @@ class FitRow(Plain):
     episode: Text
     loss: NonNegative
     rms_start_mm: NonNegative | None = None
-    """None where the start diverges."""
+    """None if the start diverges."""
     rms_mm: NonNegative
 
 
 class PredictionRow(Plain):
-    """A row of tables/predictions.csv. Its other columns are parameters and their truth."""
+    """A row of tables/predictions.csv. Its other columns are parameters and their true values."""
 
     model_config = ConfigDict(extra="allow")
     __pydantic_extra__: dict[str, Value] = Field(init=False)
@@ -139,12 +139,13 @@ class PredictionRow(Plain):
 
 
 def check_file(model: Any, path: Path, content: Any) -> None:
-    """
+    """Check the content of a file against its data model.
+
     Args:
-        model: of the content; of a table, a list of the model of its rows.
+        model: model of the content; for a table, a list of its row model.
 
     Raises:
-        ConfigError: a file is not as this version's `python -m pipeline.evaluate` writes it; names the field.
+        ConfigError: the file was not written by this version's `python -m pipeline.evaluate`; names the field.
     """
     try:
         TypeAdapter(model).validate_python(content)

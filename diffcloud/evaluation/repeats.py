@@ -1,8 +1,7 @@
-"""What repeats of one fabric say of the parameters: repeatability, transfer, agreement between lift and fold.
+"""Repeated recordings of one fabric: repeatability, transfer, and agreement between lift and fold.
 
-None of this needs a ground truth. Parameters that belong to the fabric must come out again when it is recorded again, must
-predict another recording of it, and must not depend on the motion. Distances between parameters are in logarithms: 0.69 is
-a factor of two.
+No true parameters are needed. Parameters that belong to the fabric must be reproducible, predict another recording of
+it, and not depend on the motion. Differences between parameters are in logarithms: 0.69 is a factor of two.
 """
 
 from __future__ import annotations
@@ -16,14 +15,14 @@ import pandas as pd
 
 
 def fit_of(record: Mapping[str, Any]) -> Mapping[str, Any] | None:
-    """What was measured of the fit itself; None if it diverges."""
+    """Return the metrics of the fit itself; None if it diverges."""
     return next((row for row in record["methods"] if row["method"] == "diffcloud"), None)
 
 
 def parameter_table(records: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
-    """One row per episode with a fit of its own: scenario, episode, fabric, category, repeat, loss, and a column
-    per parameter but those fitted too because they are not known exactly, with their `ratio` where both are
-    there. Joint fits are left out: their recordings agree because they were made to."""
+    """Return one row per episode with its own fit: scenario, episode, fabric, category, repeat, loss and parameters.
+    `ratio` is stretching over density, if both are there. Nuisance parameters are omitted. Joint fits are omitted,
+    since their recordings share the parameters."""
     rows = []
     for record in records:
         fit = fit_of(record)
@@ -31,7 +30,7 @@ def parameter_table(records: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
             continue
         row = {key: record[key] for key in ("scenario", "episode", "fabric", "category", "repeat")}
         if record["truth"]:
-            row["fabric"] = None  # a simulated target has known parameters; its label names no cloth that is met again
+            row["fabric"] = None  # for a simulated target, the label does not identify a physical cloth
         row |= {"loss": fit["loss"]}
         row |= {name: value for name, value in fit["clipped"].items() if name not in record["nuisance"]}
         if {"stretching", "density"} <= fit["clipped"].keys():
@@ -41,10 +40,10 @@ def parameter_table(records: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
 
 
 def repeatability(fits: pd.DataFrame) -> pd.DataFrame:
-    """Spread of each parameter over the repeats of a fabric in a scenario.
+    """Return the spread of each parameter over the repeats of a fabric in a scenario.
 
     Returns:
-        scenario, fabric, parameter, repeats, median, factor: the largest fitted value over the smallest.
+        scenario, fabric, parameter, repeats, median, factor: ratio of the largest to the smallest fitted value.
     """
     rows = []
     for (scenario, fabric), group in _fabrics(fits, ["scenario", "fabric"]):
@@ -66,12 +65,12 @@ def repeatability(fits: pd.DataFrame) -> pd.DataFrame:
 
 
 def transfer(records: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
-    """Parameters fitted on one recording, on another one of the same fabric.
+    """Return the metrics of parameters fitted to one recording, on another one of the same fabric.
 
     Returns:
-        scenario, fabric, source, target, loss: of the source's parameters on the target; loss_own: of the target's own fit;
-        loss_middle: of the middle of the range; gain: how much of the way from the middle to the own fit the transferred
-        parameters go (1: as good as its own fit, 0: no better than the middle, below: worse).
+        scenario, fabric, source, target; loss: of the source's parameters on the target; loss_own: of the target's own
+            fit; loss_middle: of the mid-range; gain: (loss_middle - loss) / (loss_middle - loss_own). A gain of 1 is as
+            good as the own fit, 0 is no better than the mid-range.
     """
     rows = []
     for record in records:
@@ -98,11 +97,11 @@ def transfer(records: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
 
 
 def consistency(fits: pd.DataFrame) -> pd.DataFrame:
-    """Whether two motions give one fabric the same parameters.
+    """Compare the parameters of one fabric between two motions.
 
     Returns:
-        fabric, parameter, first, second: scenarios; value_first, value_second: geometric means over the repeats; factor:
-        the larger over the smaller.
+        fabric, parameter, first, second: scenarios; value_first, value_second: geometric means over the repeats;
+            factor: ratio of the larger to the smaller.
     """
     rows = []
     for (fabric,), group in _fabrics(fits, ["fabric"]):
@@ -128,7 +127,7 @@ def consistency(fits: pd.DataFrame) -> pd.DataFrame:
 def other_repeats(
     episodes: Mapping[str, Mapping[str, Any]], fits: Mapping[str, Mapping[str, float]]
 ) -> dict[str, dict[str, Mapping[str, float]]]:
-    """Episode -> the other recordings of its fabric and the parameters fitted on them.
+    """Return for each episode the other recordings of its fabric with the parameters fitted to them.
 
     Args:
         episodes: name -> meta of one scenario's episodes.
@@ -152,6 +151,6 @@ def _fabrics(fits: pd.DataFrame, by: list[str]) -> list[tuple[tuple[str, ...], p
 
 
 def _positive(group: pd.DataFrame) -> list[str]:
-    """Parameters whose logarithms exist, in all rows."""
+    """Return the parameters that are positive in all rows, so that their logarithms exist."""
     labels = {"scenario", "episode", "fabric", "category", "repeat", "loss"}
     return [str(name) for name in group.columns if name not in labels and bool((group[name].astype(float) > 0).all())]

@@ -1,4 +1,4 @@
-"""Tables over all episodes, who wins, and the sentences that say so."""
+"""Tables over all episodes, and sentences that summarise them."""
 
 from __future__ import annotations
 
@@ -27,18 +27,18 @@ LABELS = {
     "random_search": "random search",
     "cma_es": "CMA-ES",
 }
-"""Method -> what a person reads."""
+"""Method -> label for people."""
 PREDICTORS = (
     "mlp", "pointnet2", "meteornet", "posterior", "published_mlp", "published_pointnet2", "published_meteornet",
 )  # fmt: skip
-"""Methods that have learned."""
+"""Trained methods."""
 _CLEARLY = 2.0
-"""Standard deviations by which losses of two methods must differ to count as different."""
+"""Difference of two losses that counts as significant, in standard deviations."""
 _FAR = 1.25
-"""Disagreement, over the interval of one recording, from which a number is not called a property of the fabric."""
+"""A value is no property of the fabric if repeats or motions differ by this multiple of its interval."""
 Records = Sequence[Mapping[str, Any]]
 Tables = Mapping[str, pd.DataFrame]
-"""Of `tables`."""
+"""Type of the result of `tables`."""
 
 
 def label(method: str) -> str:
@@ -46,10 +46,11 @@ def label(method: str) -> str:
 
 
 def method_table(records: Records, references: Mapping[tuple[str, str], float] | None = None) -> pd.DataFrame:
-    """One row per episode and method: labels, metrics, parameters; gaps have a `status` that is not `ok` and a reason.
+    """Return one row per episode and method: labels, metrics, parameters. Missing methods have a `status` other than
+    `ok` and a reason.
 
     Args:
-        references: (scenario, episode) -> loss of the reference simulator's own fit, as it was measured there; the column
+        references: (scenario, episode) -> loss of the reference simulator's own fit, measured there, for the column
             `reference_loss`.
     """
     rows: list[dict[str, Any]] = []
@@ -69,8 +70,9 @@ def method_table(records: Records, references: Mapping[tuple[str, str], float] |
 
 
 def fit_table(records: Records) -> pd.DataFrame:
-    """One row per fit: losses of its start and its end in squared length units and as RMS in millimetres, the means over
-    the episodes of a joint fit; fitted and true parameters; stretching over density, which a motion identifies best."""
+    """Return one row per fit: losses at start and end in squared length units and as RMS [mm], fitted and true
+    parameters. Losses are means over the episodes of a joint fit. The ratio stretching over density is included,
+    because a motion identifies it best."""
     fits: dict[tuple[str, str], list[tuple[Mapping[str, Any], Mapping[str, Any]]]] = {}
     for record in records:
         fit = fit_of(record)
@@ -101,13 +103,14 @@ def fit_table(records: Records) -> pd.DataFrame:
 
 
 def _mean_of(rows: Sequence[Mapping[str, Any]], name: str) -> float:
-    """Of a metric; not a number if one of the rows lacks it."""
+    """Return the mean of a metric; NaN if a row lacks it."""
     return float(np.mean([row.get(name, math.nan) for row in rows]))
 
 
 def method_means(table: pd.DataFrame) -> pd.DataFrame:
-    """One row per scenario and method, over the episodes where it says something: means of distances and simulations,
-    medians of errors, success rate, and in how many episodes no other has a clearly lower loss (`best`)."""
+    """Return one row per scenario and method, over the episodes with a result. It has means of distances and
+    simulations, medians of errors, and the success rate. `best` is the number of episodes in which no other method has
+    a significantly lower loss."""
     measured = table[table["status"] == "ok"]
     lowest = measured.groupby(["scenario", "episode"])["loss"].transform("min")
     best = measured["loss"] <= lowest + _CLEARLY * measured["loss_deviation"]
@@ -127,7 +130,7 @@ def method_means(table: pd.DataFrame) -> pd.DataFrame:
 
 
 def category_means(table: pd.DataFrame) -> pd.DataFrame:
-    """Mean loss and RMS distance per scenario, category and method, of episodes with a category."""
+    """Return mean loss and RMS distance per scenario, category and method, for episodes with a category."""
     measured = table[(table["status"] == "ok") & table["category"].notna()]
     if measured.empty:
         return pd.DataFrame(columns=["scenario", "category", "method", "episodes", "loss", "rms_mm"])
@@ -136,7 +139,7 @@ def category_means(table: pd.DataFrame) -> pd.DataFrame:
 
 
 def seconds_table(seconds: Mapping[tuple[str, str], Mapping[str, Mapping[str, float]]]) -> pd.DataFrame:
-    """One row per episode and method with its wall time in each phase and in all [s].
+    """Return one row per episode and method with its wall time in each phase and in total [s].
 
     Args:
         seconds: (scenario, episode) -> method -> phase -> seconds.
@@ -152,8 +155,8 @@ def seconds_table(seconds: Mapping[tuple[str, str], Mapping[str, Mapping[str, fl
 
 
 def interval_table(records: Records) -> pd.DataFrame:
-    """One row per episode and parameter: fitted value, interval, status, what the ratio is known within, the
-    best-determined combination, and the three largest sources of uncertainty."""
+    """Return one row per episode and parameter: fitted value, interval, status, interval of the ratio, best-determined
+    combination, and the three largest sources of uncertainty."""
     rows = []
     for record in records:
         told = record["intervals"]
@@ -174,7 +177,7 @@ def interval_table(records: Records) -> pd.DataFrame:
 
 
 def _posterior(record: Mapping[str, Any], name: str, nominal: float) -> tuple[float | None, float | None]:
-    """The interval that a posterior gives a parameter, in SI units, if there is one."""
+    """Return the interval of a parameter from a network's posterior in SI units, or (None, None)."""
     stated = [row["intervals"] for row in record["methods"] if row.get("intervals")]
     if not stated or name not in stated[0]:
         return None, None
@@ -183,8 +186,8 @@ def _posterior(record: Mapping[str, Any], name: str, nominal: float) -> tuple[fl
 
 
 def percent(share: float) -> str:
-    """Return a share (1 is 100 %) as text: "42 %", "0.4 %", "less than 0.1 %". Only an exact zero reads "0 %", and no share
-    below 1 reads "100 %"."""
+    """Return a fraction (1 is 100 %) as text: "42 %", "0.4 %", "less than 0.1 %". Only an exact zero reads "0 %", and
+    no fraction below 1 reads "100 %"."""
     value = 100 * share
     for digits in (0, 1):
         rounded = round(value, digits)
@@ -199,7 +202,7 @@ def against(below: float) -> str:
 
 
 def largest_sources(sources: Mapping[str, Mapping[str, float]], name: str, count: int = 3) -> str:
-    """What to improve first: the largest sources of a parameter's variance, with their parts of it."""
+    """Return the largest sources of a parameter's variance as text, with their percentages."""
     largest = max((abs(deviations[name]) for deviations in sources.values()), default=0.0) or 1.0
     variances = {source: (deviations[name] / largest) ** 2 for source, deviations in sources.items()}  # none overflows
     total = sum(variances.values()) or 1.0
@@ -214,7 +217,7 @@ def tables(
     seconds: Mapping[tuple[str, str], Mapping[str, Mapping[str, float]]],
     references: Mapping[tuple[str, str], float] | None = None,
 ) -> dict[str, pd.DataFrame]:
-    """All tables of the comparison by file name; `seconds` alone holds wall times."""
+    """Return all tables of the comparison by file name. Only `seconds` has wall times."""
     methods = method_table(records, references)
     parameters = parameter_table(records)
     return {
@@ -232,12 +235,12 @@ def tables(
 
 
 def against_predictors(table: pd.DataFrame) -> pd.DataFrame:
-    """DiffCloud against the best learned or published predictor.
+    """Compare DiffCloud with the best trained or published predictor.
 
     Returns:
-        scenario, episodes, lowest: in how many DiffCloud's loss is the lowest within the sampling noise; predictor: the one
-        with the lowest mean beside DiffCloud's in the same episodes; predictor_loss, loss: these means; below: by how much
-        of the first the second is lower.
+        scenario, episodes; lowest: number of episodes in which DiffCloud's loss is the lowest to within sampling noise;
+            predictor: the one with the lowest mean relative to DiffCloud's in the same episodes; predictor_loss, loss:
+            these means; below: relative difference, positive if DiffCloud's is lower.
     """
     measured = table[table["status"] == "ok"]
     rows = []
@@ -249,7 +252,7 @@ def against_predictors(table: pd.DataFrame) -> pd.DataFrame:
             continue
         both = losses[losses["diffcloud"].notna() & losses[predictors].notna().any(axis=1)]
         lowest = both["diffcloud"] <= both[predictors].min(axis=1) + _CLEARLY * noise.loc[both.index, "diffcloud"]
-        # over the episodes that each one has: one that fails in a hard episode must not look better for it
+        # compare on each predictor's own episodes, so that failing in a hard episode is no advantage
         ratios = {
             name: float(both["diffcloud"][both[name].notna()].mean() / both[name].mean())
             for name in predictors
@@ -274,7 +277,8 @@ def against_predictors(table: pd.DataFrame) -> pd.DataFrame:
 
 
 def against_reference(table: pd.DataFrame, *, within: float = 0.05) -> tuple[int, int] | None:
-    """(episodes where DiffCloud's loss is at most that part above the reference simulator's own fit, episodes with one)."""
+    """Return the number of episodes in which DiffCloud's loss is at most `within` above the reference simulator's fit,
+    and the number of episodes with such a fit."""
     if "reference_loss" not in table:
         return None
     known = table[(table["method"] == "diffcloud") & (table["status"] == "ok") & table["reference_loss"].notna()]
@@ -282,7 +286,7 @@ def against_reference(table: pd.DataFrame, *, within: float = 0.05) -> tuple[int
 
 
 def metrics(told: Tables) -> dict[str, Any]:
-    """All numbers of the comparison: scenario -> method -> means; who wins; what is identified. No wall times."""
+    """Return all numbers of the comparison: means per scenario and method, best methods, statuses. No wall times."""
     by_scenario: dict[str, Any] = {}
     for row in told["means"].to_dict("records"):
         entry = {str(key): value for key, value in row.items() if key not in ("scenario", "method") and not _unknown(value)}
@@ -305,14 +309,14 @@ def metrics(told: Tables) -> dict[str, Any]:
 
 
 def headline(told: Tables) -> dict[str, Any]:
-    """The few numbers of `metrics.json`, to compare revisions by; 4 significant digits, no wall times.
+    """Return the main numbers for `metrics.json`, to compare revisions: 4 significant digits, no wall times.
 
-    Networks are left out: with other rounding, as of another processor, training ends with other weights, and the same
-    draws and settings give distances that differ by a quarter. `tables/means.csv` has them.
+    Networks are omitted. Their training depends on the rounding of the processor, and with the same samples and
+    settings distances may differ by a quarter. `tables/means.csv` has them.
 
     Returns:
-        scenario -> `rms_mm` (method -> mean RMS distance at the compared frames [mm]) and, of the fits where known,
-        `rms_other_frames_mm` (mean) and `ratio_factor` (median factor, at least 1, between fitted and true ratios).
+        scenario -> `rms_mm` (method -> mean RMS distance at the compared frames [mm]). If known for the fits, also
+            `rms_other_frames_mm` (mean) and `ratio_factor` (median factor, at least 1, between fitted and true ratios).
     """
     found: dict[str, Any] = {}
     for row in told["means"].to_dict("records"):
@@ -337,7 +341,7 @@ def _rounded(value: Any) -> Any:
 
 
 def sentences(told: Tables) -> dict[str, list[str]]:
-    """The comparison in plain words, by topic: winners, success, intervals, repeats, credibility."""
+    """Return the comparison as sentences by topic: best methods, success, intervals, repeats, credibility."""
     return {
         "winners": _winners(told),
         "success": _success(told),
@@ -348,8 +352,8 @@ def sentences(told: Tables) -> dict[str, list[str]]:
 
 
 def overview(told: Tables) -> pd.DataFrame:
-    """One row per scenario: the methods with the lowest and the next mean loss, the middle of the range, how far
-    DiffCloud's mean is below the best predictor's, and the status that most episodes give on each parameter."""
+    """Return one row per scenario. It has the methods with the two lowest mean losses, the mid-range baseline, the
+    difference to the best predictor, and the most frequent status of each parameter."""
     below = {row["scenario"]: row["below"] for row in against_predictors(told["methods"]).to_dict("records")}
     statuses = told["intervals"]
     rows = []
@@ -459,7 +463,7 @@ def _repeats(told: Tables) -> list[str]:
 
 
 def _credibility(told: Tables) -> list[str]:
-    """What one recording promises about a parameter beside what repeats and another motion of the same fabric say."""
+    """Compare the intervals of one recording with the spread over repeats and another motion of the same fabric."""
     promised, repeats, motions = told["intervals"], told["repeatability"], told["consistency"]
     if promised.empty or repeats.empty:
         return []
@@ -480,7 +484,7 @@ def _credibility(told: Tables) -> list[str]:
         text += ", ".join(
             f"{what} {_times(factors.median())}, at most {factors.max():.3g}" for what, factors in spreads.items()
         )
-        # the worst fabric decides: the next one may be like it
+        # use the worst fabric, since a new one may be like it
         if max(factors.max() for factors in spreads.values()) > _FAR * own:
             text += ": the number holds for its own recording, and not for the fabric to that precision"
         else:

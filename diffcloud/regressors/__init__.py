@@ -1,7 +1,5 @@
-"""Inverse models: networks that look at point clouds and predict simulator parameters (paper, section IV-B).
-
-`training` is not imported here: it brings Lightning, which predictions do without.
-"""
+"""Inverse models: networks that predict simulator parameters from point clouds (paper, section IV-B). `training` is not
+imported here, because it imports Lightning, which predictions do not need."""
 
 from diffcloud.regressors.checkpoints import Description, Prediction, Regressor
 from diffcloud.regressors.dataset import Augmentation, CloudDataset, SimulatedSet

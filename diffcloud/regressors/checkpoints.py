@@ -1,7 +1,7 @@
-"""A trained regressor, and its file: weights as safetensors with a JSON description in the header.
+"""A trained regressor and its file: safetensors weights with a JSON description in the header.
 
-Nothing in such a file is executed when it is read. The description holds all that a prediction needs: which frames, how
-clouds are centred and scaled, and what the outputs stand for.
+Reading a file executes no code from it. The description has all that a prediction needs: frame times, scaling of the
+clouds, and the meaning of the outputs.
 """
 
 from __future__ import annotations
@@ -33,26 +33,26 @@ from diffcloud.regressors.settings import Target
 
 _KEY = "diffcloud"
 _WIDEST = 5.0
-"""Bound of the logarithm of a predicted width: what is beyond is an accident of the last layer."""
+"""Bound on the logarithm of a predicted width, to exclude extreme outputs."""
 SAMPLES = 1000
-"""Drawn from a posterior."""
+"""Number of samples from a posterior."""
 _SEED = 0
-"""Of these draws: the same clouds give the same prediction."""
+"""Seed of these samples, so that the same clouds give the same prediction."""
 Count = Annotated[int, Field(ge=1, le=10**6)]
 _MOST_POINTS = 10**7
-"""Of all frames together."""
+"""Maximum number of points in all frames together."""
 
 
 class BackgroundBody(BaseModel):
-    """What is left out of clouds before a network sees them."""
+    """Fixed body whose points are removed from clouds before the network."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     nodes: Annotated[tuple[tuple[float, float, float], ...], Field(min_length=3, max_length=10**5)]
-    """[length unit]"""
+    """Vertices of the body [length unit]."""
     faces: Annotated[tuple[tuple[int, int, int], ...], Field(min_length=1, max_length=10**5)]
     reach: Annotated[float, Field(gt=0)]
-    """What is nearer is the body's [length unit]."""
+    """Points closer to the body than this are removed [length unit]."""
 
     @model_validator(mode="after")
     def _faces_exist(self) -> Self:
@@ -69,7 +69,7 @@ class BackgroundBody(BaseModel):
 
 
 class Description(BaseModel):
-    """What a checkpoint says about itself."""
+    """Header of a checkpoint."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
@@ -77,27 +77,27 @@ class Description(BaseModel):
     model: ModelName
     scenario: str
     names: Annotated[tuple[str, ...], Field(min_length=1, max_length=100)]
-    """k parameters."""
+    """Names of the k parameters."""
     bounds: tuple[tuple[float, float], ...]
     target: Target = "linear"
     predict_variance: bool = False
     times: Annotated[tuple[float, ...], Field(min_length=1, max_length=10**4)]
-    """Of the frames that it sees, since the start of the motion [s]."""
+    """Times of the input frames since the start of the motion [s]."""
     frame_time: Annotated[float, Field(gt=0)]
-    """Between frames [s]."""
+    """Time between frames [s]."""
     points: Count
-    """Per frame."""
+    """Number of points per frame."""
     centre: tuple[float, float, float]
-    """Taken from clouds before they are scaled [length unit]."""
+    """Subtracted from clouds before scaling [length unit]."""
     length: Annotated[float, Field(gt=0)]
-    """The scenario's length: clouds are divided by it [length unit]."""
+    """Clouds are divided by this length [length unit]."""
     length_unit_m: Annotated[float, Field(gt=0)] = 1.0
     background: BackgroundBody | None = None
     order: Order = "cloud"
     density: Annotated[float, Field(gt=0, le=1)] = 1.0
     spread: tuple[float, ...]
-    """Laplace width of each parameter's error, as a fraction on the target's scale; with a predict_variance head, the
-    factor on the width that it predicts. From the validation draws."""
+    """Laplace width of each parameter's error on the target's scale, from the validation samples. With a
+    predict_variance head, the factor on the predicted width."""
     training: dict[str, Any] = {}
     """Settings of the training."""
 
@@ -121,7 +121,7 @@ class Description(BaseModel):
         return len(self.names) * (2 if self.predict_variance else 1)
 
     def build(self, *, dropout: float | None = None) -> nn.Module:
-        """The network with fresh weights."""
+        """Return the network with new random weights."""
         return build_network(
             self.model, self.outputs, frames=len(self.times), dropout=dropout, order=self.order, density=self.density
         )
@@ -129,26 +129,26 @@ class Description(BaseModel):
 
 @dataclass(frozen=True)
 class OutputScale:
-    """From a network's outputs to parameters and back."""
+    """Conversion between a network's outputs and parameters."""
 
     bounds: Tensor
-    """[k, 2]"""
+    """[k, 2] lower and upper bounds."""
     target: Target
 
     def values(self, fractions: Tensor) -> Tensor:
-        """[..., k] fractions of the way between the bounds -> parameters in their own units; not clipped."""
+        """Convert fractions [..., k] of the range on the target's scale to parameters, without clipping."""
         low, high = self.bounds.unbind(-1)
         if self.target == "logarithmic":
             return low * (high / low) ** fractions
         return low + (high - low) * fractions
 
     def fractions(self, values: Tensor) -> Tensor:
-        """The inverse of `values`."""
+        """Convert parameters to fractions, the inverse of `values`."""
         low, high = self.bounds.unbind(-1)
         return self.from_linear((values - low) / (high - low))
 
     def from_linear(self, fractions: Tensor) -> Tensor:
-        """[..., k] linear fractions, as data sets have them -> fractions on this scale."""
+        """Convert linear fractions [..., k], as in data sets, to fractions on the target's scale."""
         if self.target == "linear":
             return fractions
         low, high = self.bounds.unbind(-1)
@@ -157,33 +157,33 @@ class OutputScale:
 
 @dataclass(frozen=True)
 class Prediction:
-    """Parameters of a batch of clouds."""
+    """Predicted parameters of a batch of clouds."""
 
     names: tuple[str, ...]
     values: Tensor
-    """[B, k] as predicted; may lie outside the bounds."""
+    """[B, k] predicted values, possibly outside the bounds."""
     fractions: Tensor
-    """[B, k] on the scale of the target."""
+    """[B, k] fractions on the target's scale."""
     width: Tensor
-    """[B, k] Laplace width on that scale; of a posterior, the one with the same central half."""
+    """[B, k] Laplace width on that scale. For a posterior, the width with the same interquartile range."""
     scale: OutputScale
     samples: Tensor | None = None
-    """[B, S, k] draws from a posterior, in the parameters' units; values are their medians."""
+    """[B, S, k] samples from a posterior in the parameters' units; `values` are their medians."""
 
     @property
     def inside(self) -> Tensor:
-        """bool [B, k]: within the bounds."""
+        """bool [B, k], whether values are within the bounds."""
         low, high = self.scale.bounds.unbind(-1)
         return (self.values >= low) & (self.values <= high)
 
     @property
     def clipped(self) -> Tensor:
-        """[B, k] brought to the bounds: what a simulation takes."""
+        """[B, k] values clipped to the bounds, for simulation."""
         low, high = self.scale.bounds.unbind(-1)
         return self.values.clamp(low, high)
 
     def interval(self, level: float) -> tuple[Tensor, Tensor]:
-        """[B, k] lower and upper end that hold the truth with this probability, if the widths or the posterior are."""
+        """Return lower and upper ends [B, k] of intervals with this probability, from the widths or the posterior."""
         if self.samples is not None:
             low, high = torch.quantile(self.samples, torch.tensor([0.5 - level / 2, 0.5 + level / 2]), dim=1)
             return low, high
@@ -191,18 +191,18 @@ class Prediction:
         return self.scale.values(self.fractions - reach), self.scale.values(self.fractions + reach)
 
     def first_intervals(self, level: float) -> dict[str, tuple[float, float]]:
-        """The same of the first cloud, by name."""
+        """Return the intervals of the first cloud by parameter name."""
         low, high = (end[0].tolist() for end in self.interval(level))
         return dict(zip(self.names, zip(low, high, strict=True), strict=True))
 
 
 def laplace_reach(level: float) -> float:
-    """Half the length of the central interval of a Laplace distribution, in widths: P(|x| <= reach) = level."""
+    """Return the half-length of the central interval of a Laplace distribution, in widths: P(|x| <= reach) = level."""
     return -math.log1p(-level)
 
 
 def split_outputs(outputs: Tensor, parameters: int) -> tuple[Tensor, Tensor]:
-    """[B, k or 2k] -> fractions [B, k] and logarithms of widths [B, k] (zero without a predict_variance head)."""
+    """Split outputs [B, k or 2k] into fractions [B, k] and log-widths [B, k] (zero without a predict_variance head)."""
     fractions = outputs[:, :parameters]
     if outputs.shape[1] == parameters:
         return fractions, torch.zeros_like(fractions)
@@ -211,7 +211,7 @@ def split_outputs(outputs: Tensor, parameters: int) -> tuple[Tensor, Tensor]:
 
 @dataclass(frozen=True)
 class Regressor:
-    """A network with all that turns clouds into parameters."""
+    """A trained network with the preparation of clouds and the conversion of outputs."""
 
     description: Description
     network: nn.Module
@@ -221,23 +221,24 @@ class Regressor:
         return OutputScale(torch.tensor(self.description.bounds), self.description.target)
 
     def predict(self, clouds: Sequence[Sequence[ArrayLike]] | Tensor, *, seed: int = 0) -> Prediction:
-        """Predict the parameters of recorded clouds, which are prepared first (`prepared`).
+        """Predict the parameters of recorded clouds, which are first processed by `prepared`.
 
         Args:
             clouds: [B][T] clouds [N, 3] of any size, or a tensor [B, T, N, 3], in the frame and length unit of the
-                scenario's scene; T frames at `description.times`. `predict_episode` finds these frames in a recording.
-            seed: of the choice of points.
+                scenario's scene; T frames at `description.times`. `predict_episode` selects these frames from a
+                recording.
+            seed: seed for the choice of points.
 
         Raises:
-            EpisodeError: another number of frames, an empty cloud, or clouds that are not finite [N, 3].
+            EpisodeError: the number of frames is wrong, or a cloud is empty, not finite or not [N, 3].
         """
         return self.predict_prepared(torch.stack([self.prepared(frames, seed=seed) for frames in clouds]))
 
     def prepared(self, frames: Sequence[ArrayLike] | Tensor, *, seed: int = 0) -> Tensor:
-        """The clouds of one recording as the network was trained on them: without background, thinned to its points.
+        """Return the clouds of one recording as in training: without background, and downsampled.
 
-        Points are drawn without repeats where there are enough. The order of a recording, by camera and by row, must not
-        decide which points a network groups.
+        Points are sampled at random, without repeats if there are enough. The order of points in a recording must not
+        affect which points a network groups.
 
         Args:
             frames: T clouds [N, 3].
@@ -246,7 +247,7 @@ class Regressor:
             float32 [T, P, 3].
 
         Raises:
-            EpisodeError: as of `predict`.
+            EpisodeError: see `predict`.
         """
         told = self.description
         if len(frames) != len(told.times):
@@ -257,7 +258,7 @@ class Regressor:
         rng = np.random.default_rng(seed)
         background = None if told.background is None else told.background.build()
         clouds = []
-        for index, frame in enumerate(frames):  # they are ragged
+        for index, frame in enumerate(frames):  # clouds differ in size
             cloud = np.asarray(frame, dtype=np.float32)
             if cloud.ndim != 2 or cloud.shape[1] != 3 or not len(cloud) or not np.isfinite(cloud).all():
                 raise EpisodeError(
@@ -271,7 +272,7 @@ class Regressor:
 
     @torch.no_grad()
     def predict_prepared(self, clouds: Tensor) -> Prediction:
-        """The same of clouds [B, T, P, 3] that are sampled as in training."""
+        """Predict the parameters of clouds [B, T, P, 3] that are sampled as in training."""
         told = self.description
         self.network.eval()
         scaled, scale = self.scaled(clouds), self.scale
@@ -286,12 +287,12 @@ class Regressor:
         return Prediction(told.names, scale.values(fractions), fractions, width, scale)
 
     def scaled(self, clouds: Tensor) -> Tensor:
-        """[B, T, P, 3] clouds as the network sees them, and where it lies."""
+        """Centre and scale clouds [B, T, P, 3] for the network, on its device."""
         clouds = clouds.to(next(self.network.parameters()))
         return (clouds - clouds.new_tensor(self.description.centre)) / self.description.length
 
     def write(self, path: Path) -> None:
-        """Write atomically; the same regressor gives the same bytes."""
+        """Write the checkpoint atomically. The same regressor gives the same bytes."""
         tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in self.network.state_dict().items()}
         write_bytes(path, save(tensors, metadata={_KEY: self.description.model_dump_json()}))
 
@@ -300,7 +301,8 @@ class Regressor:
         """Read and check a checkpoint.
 
         Raises:
-            CheckpointError: missing, damaged, or not a regressor of this project; names the file and the field.
+            CheckpointError: the file is missing, damaged, or not a regressor of this project; names the file and the
+                field.
         """
         path = Path(path)
         if not path.exists():
@@ -323,12 +325,12 @@ class Regressor:
             where = ".".join(map(str, first["loc"])) or "description"
             raise CheckpointError(f"{path}: {where}: {first['msg']}, got {first['input']!r}.") from error
         try:
-            with nullcontext() if described.model == "posterior" else torch.device("meta"):  # whose masks are computed
+            with nullcontext() if described.model == "posterior" else torch.device("meta"):  # its masks are computed
                 network = described.build()
         except ConfigError as error:
             raise CheckpointError(f"{path}: {error}") from error
         _check_tensors(path, network, tensors)
-        # copies, since kernels take other paths, with other last bits, where memory is not aligned as torch aligns it
+        # copies are aligned like torch's own tensors; other alignment changes the last bits of results
         network.load_state_dict({name: tensor.clone() for name, tensor in tensors.items()}, assign=True)
         return Regressor(described, network.eval())
 

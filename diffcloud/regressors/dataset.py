@@ -1,4 +1,4 @@
-"""Training data: clouds drawn from a simulated set as they are needed, and the parameters behind them."""
+"""Training data: clouds sampled on demand from a simulated set, with their parameters."""
 
 from __future__ import annotations
 
@@ -20,11 +20,9 @@ Frames = Literal["loss", "all"]
 
 
 class CloudDataset(Dataset[tuple[Tensor, Tensor]]):
-    """Clouds and parameters of the runs of a simulated set; the same for the same (seed, epoch, run), whatever the batch.
-
-    An item is (clouds float32 [T', points, 3], parameters float32 [k]), the parameters scaled so that the bounds are 0 and
-    1. A `DataLoader` fetches whole batches at once; `batch` gives them without one.
-    """
+    """Clouds and parameters of the runs of a simulated set. They depend on (seed, epoch, run) only, not on the batch.
+    An item is (clouds float32 [T', points, 3], parameters float32 [k]). Parameters are scaled so that the bounds are 0
+    and 1. `batch` returns whole batches directly, and a `DataLoader` fetches them too."""
 
     def __init__(
         self,
@@ -37,16 +35,17 @@ class CloudDataset(Dataset[tuple[Tensor, Tensor]]):
         seed: int = 0,
         device: torch.device | str = "cpu",
     ) -> None:
-        """
+        """Prepare the clouds of a simulated set.
+
         Args:
-            augmentation: default the paper's; `Augmentation.none()` for whole surfaces without noise.
+            augmentation: default: that of the paper; `Augmentation.none()` for noise-free whole surfaces.
             frames: "loss": the frame of the scenario's loss, T' = 1; "all": those of a recorded episode.
-            points: of each cloud.
-            background: left out of the clouds.
-            device: where clouds are made.
+            points: number of points per cloud.
+            background: body whose points are removed from the clouds.
+            device: device on which clouds are computed.
 
         Raises:
-            ConfigError: no points, or an unknown choice of frames.
+            ConfigError: there are no points, or the choice of frames is unknown.
         """
         if frames not in ("loss", "all"):
             raise ConfigError(unknown_name("choice of frames", frames, ("loss", "all")))
@@ -55,7 +54,7 @@ class CloudDataset(Dataset[tuple[Tensor, Tensor]]):
             slice(simulated.first_frame, None) if frames == "all" else slice(simulated.loss_frame, simulated.loss_frame + 1)
         )
         self.times = torch.as_tensor(simulated.times[chosen])
-        """[T'] of the clouds since the start [s]."""
+        """[T'] times of the clouds since the start [s]."""
         augmentation = Augmentation() if augmentation is None else augmentation
         self._maker = CloudMaker.build(simulated, augmentation, points=points, background=background, device=device)
         self._nodes = torch.as_tensor(simulated.nodes[:, chosen], device=device)
@@ -68,11 +67,11 @@ class CloudDataset(Dataset[tuple[Tensor, Tensor]]):
         return len(self.simulated)
 
     def set_epoch(self, epoch: int) -> None:
-        """New random numbers for every run; a persistent worker of a `DataLoader` has its own copy and does not see it."""
+        """Use new random numbers for every run. Persistent workers of a `DataLoader` keep their own copy."""
         self.epoch = epoch
 
     def batch(self, runs: Sequence[int] | Tensor) -> tuple[Tensor, Tensor]:
-        """(clouds [B, T', points, 3], parameters [B, k]) of runs [B]."""
+        """Return (clouds [B, T', points, 3], parameters [B, k]) of runs [B]."""
         index = torch.as_tensor(runs, dtype=torch.int64, device=self._nodes.device)
         seen = None if self._seen is None else self._seen[index]
         return self._maker.clouds(self._nodes[index], run_keys(self.seed, self.epoch, index), seen), self._parameters[index]
@@ -82,5 +81,5 @@ class CloudDataset(Dataset[tuple[Tensor, Tensor]]):
         return clouds[0], parameters[0]
 
     def __getitems__(self, runs: list[int]) -> list[tuple[Tensor, Tensor]]:
-        """What a `DataLoader` calls for a batch."""
+        """Return the items of a batch; a `DataLoader` calls this."""
         return list(zip(*self.batch(runs), strict=True))

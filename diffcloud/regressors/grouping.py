@@ -1,9 +1,9 @@
-"""Choosing centroids and their neighbours in point clouds: what PointNet++ and MeteorNet do before they compute.
+"""Choice of centroids and their neighbours in point clouds, for PointNet++ and MeteorNet.
 
-Plain batched torch: dtype and device follow the inputs, and indices carry no gradient. Both originals take the first
-points inside a ball in the order of the cloud, which is a random choice only where that order is random; `order="nearest"`
-takes the nearest ones instead, so that the result is a function of the set. A ball with fewer points than asked repeats
-its first one, which a maximum over the group does not see.
+Everything is plain batched torch. Dtype and device follow the inputs, and indices have no gradient. Both original
+implementations take the first points inside a ball in the order of the cloud. This is a random choice only if the order
+is random. `order="nearest"` takes the nearest points instead, so the result does not depend on the order. If a ball has
+too few points, its first one is repeated, which does not affect the maximum over the group.
 
 Sources: Qi et al. 2017, "PointNet++", section 3.2; Liu et al. 2019, "MeteorNet", section 3.2 (direct grouping).
 """
@@ -19,30 +19,23 @@ from torch import Tensor
 from diffcloud.errors import ConfigError
 
 Order = Literal["cloud", "nearest"]
-"""Which points of a ball make its group: the first in the cloud's order, or the nearest."""
+"""Points of a ball that form its group: the first ones in the cloud's order, or the nearest ones."""
 _CHUNK_BYTES = 256 * 2**20
 
 
 def gather_points(values: Tensor, index: Tensor) -> Tensor:
-    """[B, N, C] values at [B, ...] indices -> [B, ..., C]; differentiable."""
+    """Gather values [B, N, C] at indices [B, ...] to [B, ..., C]; differentiable."""
     batch, points, channels = values.shape
     first = torch.arange(batch, device=values.device).view(-1, *[1] * (index.dim() - 1)) * points
-    # index_select on joined clouds: its derivative is the quickest of the equivalents on a CPU
+    # index_select on joined clouds has the fastest backward pass of the equivalents on a CPU
     return values.reshape(-1, channels).index_select(0, (index + first).flatten()).view(*index.shape, channels)
 
 
 @torch.no_grad()
 def canonical_start(points: Tensor) -> Tensor:
-    """The point farthest from the middle of the cloud's bounding box; ties go to the largest x, then y, then z.
-
-    The box, unlike the mean, does not depend on the order of the points in its last bits.
-
-    Args:
-        points: [B, N, 3].
-
-    Returns:
-        [B] indices.
-    """
+    """Return the index [B] of the point farthest from the centre of the bounding box of points [B, N, 3]. Ties are
+    resolved by the largest x, then y, then z. Unlike the mean, the box does not depend on the order of the points, not
+    even in the last bits."""
     middle = 0.5 * (points.amin(1, keepdim=True) + points.amax(1, keepdim=True))
     distance = (points - middle).square().sum(-1, keepdim=True)
     candidate = torch.ones_like(distance[..., 0], dtype=torch.bool)
@@ -54,17 +47,15 @@ def canonical_start(points: Tensor) -> Tensor:
 
 @torch.no_grad()
 def farthest_points(points: Tensor, count: int) -> Tensor:
-    """Farthest point sampling from the canonical start: each next point is the one farthest from those taken.
+    """Return the indices [B, M] of farthest point sampling: each next point is the one farthest from those already
+    chosen. The first is `canonical_start`. Ties depend on the device.
 
     Args:
         points: [B, N, 3].
         count: M, at most N.
 
-    Returns:
-        [B, M] indices; which of two equally far points comes first is left to the device.
-
     Raises:
-        ConfigError: more points asked than there are.
+        ConfigError: more points are requested than there are.
     """
     available = points.shape[1]
     if not 1 <= count <= available:
@@ -73,7 +64,7 @@ def farthest_points(points: Tensor, count: int) -> Tensor:
     last = canonical_start(points)[:, None]
     chosen = [last]
     nearest = torch.full_like(x, torch.inf)
-    distance, along = torch.empty_like(x), torch.empty_like(x)  # buffers: a step is a handful of passes over memory
+    distance, along = torch.empty_like(x), torch.empty_like(x)  # reused buffers
     for _ in range(count - 1):  # each centroid depends on the one before
         torch.sub(x, x.gather(1, last), out=distance).square_()
         distance.addcmul_(torch.sub(y, y.gather(1, last), out=along), along)
@@ -88,16 +79,16 @@ def farthest_points(points: Tensor, count: int) -> Tensor:
 def ball_groups(
     points: Tensor, centroids: Tensor, radii: Sequence[float], counts: Sequence[int], *, order: Order
 ) -> list[Tensor]:
-    """Neighbours of each centroid in several balls at once (multi-scale grouping).
+    """Return the neighbours of each centroid in several balls at once (multi-scale grouping).
 
     Args:
         points: [B, N, 3].
         centroids: [B, M, 3].
-        radii: of the balls.
-        counts: K of each ball.
+        radii: radius of each ball.
+        counts: number of neighbours K of each ball.
 
     Returns:
-        One [B, M, K] of indices per ball. An empty ball holds the nearest point.
+        Indices [B, M, K] for each ball. An empty ball has the nearest point.
     """
     found = [
         [_members(squared, radius**2, count, order) for radius, count in zip(radii, counts, strict=True)]
@@ -118,21 +109,21 @@ def space_time_groups(
     count: int,
     order: Order,
 ) -> Tensor:
-    """Meteor's direct grouping: neighbours within a radius that grows linearly with the difference in time.
+    """Return the neighbours within a radius that grows linearly with the time difference (MeteorNet's direct grouping).
 
-    A point at distance d and time difference t is inside if d <= radius (1 + growth |t|); the nearest have the
+    A point at distance d and time difference t is inside if d <= radius (1 + growth |t|). The nearest points have the
     smallest d / (radius (1 + growth |t|)).
 
     Args:
-        points: [B, N, 3] of all frames joined.
+        points: [B, N, 3] points of all frames.
         times: [B, N], from 0 to 1 over a sequence.
         centroids: [B, M, 3].
         centroid_times: [B, M].
-        growth: 0.2 lets the radius reach 1.2 times itself over a whole sequence.
-        count: K.
+        growth: relative growth of the radius over a whole sequence, e.g. 0.2.
+        count: number of neighbours K.
 
     Returns:
-        [B, M, K] indices; an empty group holds the nearest point.
+        Indices [B, M, K]; an empty group has the nearest point.
     """
     found = []
     parts = zip(_chunks(centroids, points), _chunks(centroid_times, points), strict=True)
@@ -143,7 +134,8 @@ def space_time_groups(
 
 
 def squared_distances(queries: Tensor, points: Tensor) -> Tensor:
-    """[B, M, 3], [B, N, 3] -> [B, M, N]; from differences, so that near points keep their digits."""
+    """Return squared distances [B, M, N] of queries [B, M, 3] to points [B, N, 3]. They are computed from differences,
+    which is accurate for nearby points."""
     total = torch.zeros(*queries.shape[:2], points.shape[1], dtype=points.dtype, device=points.device)
     for a, b in zip(queries.unbind(-1), points.unbind(-1), strict=True):  # three axes
         total += (a[:, :, None] - b[:, None]).square_()
@@ -151,13 +143,13 @@ def squared_distances(queries: Tensor, points: Tensor) -> Tensor:
 
 
 def _chunks(queries: Tensor, points: Tensor) -> tuple[Tensor, ...]:
-    """Queries [B, M, ...] in parts whose distances to all points fit in a bounded memory."""
+    """Split queries [B, M, ...] into parts whose distances to all points fit in bounded memory."""
     batch, count, _ = points.shape
     return queries.split(max(1, _CHUNK_BYTES // (3 * points.element_size() * batch * count)), dim=1)
 
 
 def _members(squared: Tensor, limit: float, count: int, order: Order) -> Tensor:
-    """[B, M, N] squared distances -> [B, M, K] indices of points within the limit."""
+    """Return indices [B, M, K] of points within the limit, from squared distances [B, M, N]."""
     nearest = squared.topk(min(count, squared.shape[-1]) if order == "nearest" else 1, dim=-1, largest=False)
     if order == "nearest":
         index = torch.where(nearest.values <= limit, nearest.indices, nearest.indices[..., :1])
@@ -165,7 +157,7 @@ def _members(squared: Tensor, limit: float, count: int, order: Order) -> Tensor:
         return torch.cat([index, index[..., :1].expand(-1, -1, missing)], dim=-1) if missing else index
     inside = squared <= limit
     rank = inside.cumsum(-1)
-    # ranks from 1; what is outside or comes too late goes to a place that is then cut off
+    # ranks start at 1; points outside or beyond the count go to an extra column, which is dropped
     place = torch.where(inside & (rank <= count), rank - 1, count)
     everyone = torch.arange(squared.shape[-1], device=squared.device).expand_as(place)
     index = place.new_zeros(*place.shape[:-1], count + 1).scatter_(-1, place, everyone)[..., :count]

@@ -1,11 +1,13 @@
-"""MeteorNet for whole sequences, with direct grouping (Liu et al. 2019, MeteorNet-cls, appendix D.2; paper, section IV-B).
+"""MeteorNet for whole sequences, with direct grouping (Liu et al. 2019, MeteorNet-cls, appendix D.2; paper, section
+IV-B).
 
-    three Meteor modules: 1,024, 512, 128 centroids of all frames' points joined; 32 neighbours within a radius that grows
+    three Meteor modules: 1,024, 512, 128 centroids of all frames' points joined; 32 neighbours within a radius that
+        grows
     with the difference in time from r to 1.2 r (r = 0.5, 1, 2); [32, 32, 64], [64, 64, 128], [128, 128, 256]
     global set abstraction [256, 512, 1024] -> 512 -> 256 -> outputs
 
-A neighbour's features are its position and time relative to the centroid and what the module before found. The radii are
-for sequences inside the unit sphere; time runs from 0 to 1 over a sequence of the trained length.
+A neighbour's features are its position and time relative to the centroid, and the output of the previous module. The
+radii are for sequences inside the unit sphere. Time runs from 0 to 1 over a sequence of the trained length.
 """
 
 from __future__ import annotations
@@ -25,7 +27,7 @@ GLOBAL_WIDTHS = (256, 512, 1024)
 
 
 class MeteorModule(nn.Module):
-    """Sample centroids in space and time, group around them, and look at each group."""
+    """Sample centroids in space and time, group points around them, and apply a network to each group."""
 
     def __init__(
         self, features: int, widths: tuple[int, ...], *, centroids: int, neighbours: int, radius: float, order: Order
@@ -35,7 +37,7 @@ class MeteorModule(nn.Module):
         self.network = LocalNetwork(4, features, widths)
 
     def forward(self, points: Tensor, times: Tensor, features: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
-        """[B, N, 3], [B, N], [B, N, C] or None -> the same of the centroids, with widths[-1] features."""
+        """Map points [B, N, 3], times [B, N] and features [B, N, C] or None to those of the centroids."""
         chosen = farthest_points(points, min(self.centroids, points.shape[1]))
         placed = torch.cat([points, times[..., None]], dim=-1)
         centroids = gather_points(placed, chosen)
@@ -54,12 +56,13 @@ class MeteorModule(nn.Module):
 
 
 class MeteorNet(nn.Module):
-    """Points of all frames -> outputs."""
+    """Network from the points of all frames to outputs."""
 
     def __init__(
         self, outputs: int, *, frames: int, dropout: float = 0.0, order: Order = "cloud", density: float = 1.0
     ) -> None:
-        """
+        """Create the network.
+
         Args:
             frames: number of frames in a training sequence, which is one unit of time long.
             density: fraction of the published numbers of centroids and neighbours. Layer widths stay as published.
@@ -84,7 +87,8 @@ class MeteorNet(nn.Module):
         self.head = Head(GLOBAL_WIDTHS[-1], outputs, dropout=(dropout, dropout))
 
     def forward(self, clouds: Tensor) -> Tensor:
-        """[B, T, P, 3] -> [B, outputs]; a sequence may be shorter or longer than the trained ones, at the same rate."""
+        """Map clouds [B, T, P, 3] to [B, outputs]. The number of frames may differ from training, but not the frame
+        rate."""
         batch, frames, count, _ = clouds.shape
         # frames alternate, so that the first points in a ball come from all of them
         points = clouds.transpose(1, 2).flatten(1, 2)

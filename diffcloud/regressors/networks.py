@@ -1,4 +1,4 @@
-"""The networks by name, and their sizes."""
+"""The networks by name, and the sizes of their layers."""
 
 from __future__ import annotations
 
@@ -21,10 +21,11 @@ MODEL_NAMES: tuple[ModelName, ...] = get_args(ModelName)
 
 
 def frames_seen(model: str) -> Frames:
-    """MeteorNet, and the posterior that it tells, see the sequence, the others the loss frame of the scenario.
+    """Return the input frames of a model: "all" for MeteorNet and the posterior, "loss" (the loss frame) for the
+    others.
 
     Raises:
-        ConfigError: no such model.
+        ConfigError: the model is unknown.
     """
     if model not in MODEL_NAMES:
         raise ConfigError(unknown_name("model", model, MODEL_NAMES))
@@ -40,13 +41,13 @@ def build_network(
     order: Order = "cloud",
     density: float = 1.0,
 ) -> nn.Module:
-    """A network with fresh weights from torch's global generator: [B, T, P, 3] -> [B, outputs], or a `Posterior` of as many
-    parameters.
+    """Return a network with new weights from torch's global generator: [B, T, P, 3] -> [B, outputs], or a `Posterior`
+    with this number of parameters.
 
     Args:
-        frames: T of the training; only MeteorNet uses it, alone and in the posterior.
-        dropout: in the head; None for the model's own.
-        order, density: of the grouping (see `grouping`, `layers.thinned`); the MLP has none.
+        frames: number of frames T in training; used by MeteorNet and the posterior.
+        dropout: rate in the head; None for the model's default.
+        order, density: settings of the grouping (see `grouping`, `layers.thinned`); not used by the MLP.
     """
     head = {} if dropout is None else {"dropout": dropout}
     match model:
@@ -62,17 +63,17 @@ def build_network(
 
 @dataclass(frozen=True)
 class LayerSize:
-    """One row of the table of layers."""
+    """Size of one linear layer."""
 
     name: str
     inputs: int
     outputs: int
     parameters: int
-    """Trainable numbers, with bias and batch normalisation."""
+    """Number of trainable parameters, including bias and batch normalisation."""
 
 
 def layer_sizes(network: nn.Module) -> list[LayerSize]:
-    """All linear layers in the order of the data."""
+    """Return the sizes of all linear layers, in the order of evaluation."""
     rows = []
     for name, module in network.named_modules():
         inside_layer = isinstance(module, nn.Linear) and name.endswith(".linear")

@@ -20,13 +20,13 @@ from diffcloud.regressors.layers import GlobalAbstraction, Head, LocalNetwork, t
 
 @dataclass(frozen=True)
 class Scales:
-    """One set abstraction's layout."""
+    """Layout of one set abstraction."""
 
     centroids: int
     radii: tuple[float, ...]
     neighbours: tuple[int, ...]
     widths: tuple[tuple[int, ...], ...]
-    """Of each radius."""
+    """Layer widths for each radius."""
 
     @property
     def outputs(self) -> int:
@@ -41,7 +41,7 @@ GLOBAL_WIDTHS = (256, 512, 1024)
 
 
 class SetAbstraction(nn.Module):
-    """Sample centroids, group around them at several scales, and look at each group."""
+    """Sample centroids, group points around them at several scales, and apply a network to each group."""
 
     def __init__(self, features: int, scales: Scales, *, order: Order, density: float) -> None:
         super().__init__()
@@ -52,7 +52,7 @@ class SetAbstraction(nn.Module):
         self.networks = nn.ModuleList(LocalNetwork(3, features, widths) for widths in scales.widths)
 
     def forward(self, points: Tensor, features: Tensor | None) -> tuple[Tensor, Tensor]:
-        """[B, N, 3], [B, N, C] or None -> centroids [B, M, 3] and their features [B, M, sum of widths]."""
+        """Map points [B, N, 3] and features [B, N, C] or None to centroids [B, M, 3] and features [B, M, C']."""
         centroids = gather_points(points, farthest_points(points, min(self.centroids, points.shape[1])))
         groups = ball_groups(points, centroids, self.radii, self.neighbours, order=self.order)
         found = [
@@ -63,10 +63,11 @@ class SetAbstraction(nn.Module):
 
 
 class PointNet2(nn.Module):
-    """Points of one frame -> outputs."""
+    """Network from the points of one frame to outputs."""
 
     def __init__(self, outputs: int, *, dropout: float = 0.5, order: Order = "cloud", density: float = 1.0) -> None:
-        """
+        """Create the network.
+
         Args:
             density: fraction of the published numbers of centroids and neighbours; the layers are the same.
         """
@@ -78,7 +79,7 @@ class PointNet2(nn.Module):
         self.head = Head(GLOBAL_WIDTHS[-1], outputs, dropout=(dropout, dropout))
 
     def forward(self, clouds: Tensor) -> Tensor:
-        """[B, T, P, 3] -> [B, outputs]; the points of all frames are one set."""
+        """Map clouds [B, T, P, 3] to [B, outputs]. The points of all frames are one set."""
         points, features = self.second(*self.first(clouds.flatten(1, 2), None))
         outputs: Tensor = self.head(self.overall(points, features))
         return outputs

@@ -1,9 +1,10 @@
-"""A posterior instead of a point: neural posterior estimation (Papamakarios and Murray 2016), with the flows of sbi.
+"""Posterior distribution of the parameters instead of a point estimate, by neural posterior estimation (Papamakarios
+and Murray 2016) with the flows of the package sbi.
 
-A network that looks at the whole motion shapes a normalising flow (Durkan et al. 2019), a density over the parameters.
-Trained on simulated clouds and the parameters behind them, the mean of -log q(parameters | clouds) is lowest where q is the
-posterior under the law that the parameters were drawn by. It shares the simulator and the noise model with the intervals of
-a fit, but neither the linearisation nor the loss.
+A network of the whole motion conditions a normalising flow (Durkan et al. 2019), which is a density of the parameters.
+It is trained on simulated clouds and their parameters. The mean of -log q(parameters | clouds) is minimal if q is the
+posterior, with the distribution of the training parameters as the prior. It uses the same simulator and noise model as
+the intervals of a fit, but no linearisation and another loss.
 """
 
 from __future__ import annotations
@@ -18,22 +19,23 @@ from diffcloud.regressors.grouping import Order
 from diffcloud.regressors.meteornet import MeteorNet
 
 _FEATURES = 32
-"""What the flow is told of the clouds."""
+"""Number of features of the clouds that condition the flow."""
 _HIDDEN, _TRANSFORMS = 48, 3
 _EDGE = 1e-4
-"""Fractions of the bounds are brought so far from 0 and 1: the flow lives on their logits."""
+"""Fractions of the range are clipped to this distance from 0 and 1, because the flow uses their logits."""
 
 
 class Posterior(nn.Module):
-    """Clouds -> a density of k parameters."""
+    """Density of k parameters, conditioned on clouds."""
 
     def __init__(
         self, parameters: int, *, frames: int, dropout: float | None = None, order: Order = "cloud", density: float = 1.0
     ) -> None:
-        """
+        """Create the network and the flow.
+
         Args:
-            parameters: k.
-            frames, dropout, order, density: of the network that looks at clouds, see `networks.build_network`.
+            parameters: number of parameters k.
+            frames, dropout, order, density: settings of the network, see `networks.build_network`.
 
         Raises:
             ConfigError: sbi is not installed.
@@ -44,20 +46,20 @@ class Posterior(nn.Module):
         self.flow = _flow(parameters)
 
     def forward(self, clouds: Tensor) -> Tensor:
-        """[B, T, P, 3] -> [B, features]."""
+        """Map clouds [B, T, P, 3] to features [B, features]."""
         features: Tensor = self.embedding(clouds)
         return features
 
     def loss(self, clouds: Tensor, fractions: Tensor) -> Tensor:
-        """Mean of -log q of fractions [B, k] of the bounds."""
+        """Return the mean of -log q for fractions [B, k] of the range."""
         found: Tensor = self.flow.loss(_logits(fractions), condition=self(clouds)).mean()
         return found
 
     def sample(self, clouds: Tensor, count: int, generator: int) -> Tensor:
-        """[B, count, k] fractions of the bounds, all between them.
+        """Return samples [B, count, k] as fractions of the range, all within the bounds.
 
         Args:
-            generator: seed of the draws.
+            generator: seed of the samples.
         """
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(generator)
@@ -65,11 +67,9 @@ class Posterior(nn.Module):
         return drawn.transpose(0, 1).sigmoid()
 
     def log_density(self, clouds: Tensor, fractions: Tensor) -> Tensor:
-        """[B, S] of fractions [B, S, k], up to a constant for each cloud: on their logits.
-
-        Two sets are ranked by it as by the density of the parameters only if the same transformation of both is meant, as
-        in a check of coverage.
-        """
+        """Return log-densities [B, S] of fractions [B, S, k], up to a constant for each cloud. They are densities of
+        the logits. This ranking differs from that by densities of the parameters, so compare only values of this
+        function, as in a coverage check."""
         found: Tensor = self.flow.log_prob(_logits(fractions).transpose(0, 1), condition=self(clouds))
         return found.transpose(0, 1)
 

@@ -1,4 +1,4 @@
-"""Parameters of a recorded episode."""
+"""Prediction of the parameters of a recorded episode."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from diffcloud.regressors.checkpoints import Prediction, Regressor
 
 
 def recorded_frames(regressor: Regressor, episode: Episode) -> list[NDArray[np.float32]]:
-    """The T clouds [N, 3] of an episode that a regressor looks at.
+    """Return the T clouds [N, 3] of an episode that a regressor needs.
 
-    Each is the recorded frame nearest in time, so that recordings of other rates, or that begin with the first moved frame,
-    fit as well.
+    Each is the recorded frame nearest in time. So recordings may have another frame rate, or begin with the first moved
+    frame.
 
     Raises:
-        EpisodeError: a frame of the training has no recorded one within a frame's time.
+        EpisodeError: there is no recorded frame within one frame time of a training frame.
     """
     told = regressor.description
     wanted = np.array(told.times)
@@ -32,12 +32,12 @@ def recorded_frames(regressor: Regressor, episode: Episode) -> list[NDArray[np.f
 
 
 def predict_episode(regressor: Regressor, episode: Episode, *, seed: int = 0) -> Prediction:
-    """Parameters of one episode, as a batch of one.
+    """Predict the parameters of one episode, as a batch of one.
 
     Args:
-        seed: of the choice of points.
+        seed: seed for the choice of points.
 
     Raises:
-        EpisodeError: the episode lacks the frames that the regressor sees.
+        EpisodeError: the episode lacks the frames that the regressor needs.
     """
     return regressor.predict([recorded_frames(regressor, episode)], seed=seed)

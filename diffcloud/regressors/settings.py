@@ -1,4 +1,4 @@
-"""How a regressor is trained: one settings block, and the named profiles."""
+"""Settings of the training of a regressor, and the named profiles."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ from diffcloud.regressors.grouping import Order
 from diffcloud.regressors.networks import MODEL_NAMES, ModelName
 
 Loss = Literal["normalised", "raw"]
-"""L1 of parameters as fractions of their bounds, or in their own units as the paper has it."""
+"""L1 loss of parameters as fractions of their range (`normalised`), or in their own units as in the paper (`raw`)."""
 Target = Literal["linear", "logarithmic"]
-"""What a network's output stands for: the fraction of the way between the bounds, or of their logarithms. The second
-weighs errors by their ratio, and keeps predictions positive."""
+"""Meaning of a network's output: fraction of the range, linear or logarithmic. Logarithmic targets weigh relative
+errors and keep predictions positive."""
 Profile = Literal["quick", "reduced", "paper"]
 PROFILE_NAMES: tuple[Profile, ...] = get_args(Profile)
 BACKGROUND_REACH_M = 0.01
-"""What is nearer to the obstacle counts as its [m]: more than a depth camera's noise, less than a fold."""
+"""Distance within which points belong to the obstacle [m]: more than a depth camera's noise, less than a fold."""
 
 
 @dataclass(frozen=True)
 class TrainingSettings:
-    """Of one training; the defaults are the paper's."""
+    """Settings of one training; the defaults are the paper's."""
 
     epochs: int = 100
     batch_size: int = 32
@@ -33,32 +33,33 @@ class TrainingSettings:
     loss: Loss = "normalised"
     target: Target = "linear"
     predict_variance: bool = False
-    """A second output per parameter: the width of a Laplace distribution, trained by its likelihood. Without, one width
-    per parameter comes from the validation draws."""
+    """Second output per parameter: the width of a Laplace distribution, trained by its likelihood. Without, one width
+    per parameter is estimated from the validation samples."""
     draws: int | None = None
-    """Training draws used; None for all."""
+    """Number of training samples to use; None for all."""
     points: int = 3500
-    """Per frame."""
+    """Points per frame."""
     augment: bool = True
     viewpoints: tuple[tuple[float, float, float], ...] = ()
-    """Of cameras that will record, in the scene: clouds show faces whose middle one of them sees, instead of random ones
-    as in the paper, of a cloth that lies about a centimetre beside its place."""
+    """Positions of the recording cameras in the scene. Clouds then have the faces whose centre at least one camera
+    sees, for a cloth displaced by about a centimetre. Default: random faces, as in the paper."""
     patience: int | None = None
-    """Stop after so many epochs without a better validation; None: never."""
+    """Stop after this many epochs without a better validation loss; None: never."""
     subtract_background: bool = False
-    """Leave out of the clouds what is nearer than 1 cm to the scenario's obstacle (the pole, the hook), whose place is
-    known. Without, most points may show what is the same in every cloud."""
+    """Remove points closer than 1 cm to the scenario's obstacle (the pole, the hook), whose position is known.
+    Otherwise most points may be the same in every cloud."""
     dropout: float | None = None
-    """In the head; None for the model's own."""
+    """Dropout rate in the head; None for the model's default."""
     order: Order = "cloud"
     density: float = 1.0
     """Fraction of the published numbers of centroids and neighbours."""
     seed: int = 0
 
     def __post_init__(self) -> None:
-        """
+        """Check the values.
+
         Raises:
-            ConfigError: a value out of range.
+            ConfigError: a value is out of range.
         """
         for name in ("epochs", "batch_size", "points", "draws", "patience"):
             value = getattr(self, name)
@@ -93,15 +94,15 @@ PROFILES: Mapping[Profile, Mapping[ModelName, TrainingSettings]] = {
     },
     "paper": dict.fromkeys(MODEL_NAMES, _PAPER),
 }
-"""`quick`: seconds, for the embedded pipeline and a first look. `reduced`: within 20 minutes of one core for 1,500
-draws. `paper`: the published numbers; for a GPU."""
+"""`quick`: seconds, for the built-in pipeline and a first test. `reduced`: within 20 minutes on one core for 1,500
+samples. `paper`: the published settings, for a GPU."""
 
 
 def profile_settings(profile: str, model: str, **changes: object) -> TrainingSettings:
-    """A profile's settings with what was given (not None) in place.
+    """Return a profile's settings, with the given values (not None) replaced.
 
     Raises:
-        ConfigError: an unknown profile or model, or a value out of range.
+        ConfigError: the profile or model is unknown, or a value is out of range.
     """
     if profile not in PROFILE_NAMES:
         raise ConfigError(unknown_name("profile", profile, PROFILE_NAMES))

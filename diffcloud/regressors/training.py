@@ -1,8 +1,8 @@
-"""Training of a regressor with Lightning: L1 on the parameters, Adam, the best weights by validation (paper, section IV-B).
+"""Training of a regressor with Lightning: L1 loss, Adam, best weights by validation (paper, section IV-B).
 
-The test draws are divided: the first part chooses the best epoch and sets the widths of the intervals, the rest is held
-out and only measured. A training is a function of its settings and data: the random numbers of every epoch come from
-(seed, epoch), so that one that was interrupted and taken up again ends as if it had not been.
+The test set is divided. The first part chooses the best epoch and the widths of the intervals. The rest is held out and
+only evaluated. A training is a function of its settings and data: the random numbers of every epoch come from (seed,
+epoch). So a training that was interrupted and resumed gives the same result.
 """
 
 from __future__ import annotations
@@ -47,20 +47,20 @@ from diffcloud.regressors.settings import BACKGROUND_REACH_M, Loss, TrainingSett
 
 Device = Literal["auto", "cpu", "gpu"]
 LEVELS = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95)
-"""Probabilities whose intervals are checked."""
+"""Probabilities of the intervals whose coverage is checked."""
 _VALIDATION = 0.4
-"""Part of the test draws that chooses the epoch; of the paper's 375, 225 are left to measure."""
+"""Fraction of the test set for validation. Of the paper's 375 samples, 225 are left for the evaluation."""
 _SCALE_SAMPLES = 64
-"""Training clouds that set the centre and the length."""
+"""Number of training clouds from which the centre and the length are computed."""
 _SAVE_EVERY_S = 10.0
 
 
 @dataclass(frozen=True)
 class TrainingProgress:
-    """What a progress display gets after each epoch."""
+    """Progress after each epoch."""
 
     epoch: int
-    """Done so far."""
+    """Number of completed epochs."""
     train_loss: float
     validation_loss: float
     best: float
@@ -68,14 +68,14 @@ class TrainingProgress:
 
 @dataclass(frozen=True)
 class TrainingResult:
-    """A finished training."""
+    """Result of a training."""
 
     regressor: Regressor
     summary: dict[str, Any]
-    """Settings, history, held-out errors, calibration: what is written beside the checkpoint."""
+    """Settings, history, held-out errors and calibration, written beside the checkpoint."""
     seconds: float
     resumed_from: int
-    """Epochs that an interrupted run had already done."""
+    """Number of epochs that an interrupted run had completed."""
 
 
 def train_regressor(
@@ -90,20 +90,21 @@ def train_regressor(
     mark: str = "",
     progress: Callable[[TrainingProgress], None] | None = None,
 ) -> TrainingResult:
-    """Train, keep the best weights, measure them on held-out draws, and write all that.
+    """Train, evaluate the best weights on held-out samples, and write the results.
 
-    Writes together: `out` (the checkpoint), a folder of the same name without suffix (`training.json`, beside DVCLive's
-    metrics, which come epoch by epoch), and the wall time beside them (`io.timings`). The state after the last saved epoch
-    lies in a hidden file beside `out` until the end; the same call takes it up.
+    It writes `out` (the checkpoint) and a folder of the same name without suffix, together with the wall time
+    (`io.timings`). The folder has `training.json` and DVCLive's metrics of each epoch. Until the end, a hidden file
+    beside `out` has the state after the last saved epoch. The same call resumes from this state.
 
     Args:
-        workers: processes that sample clouds, on the CPU; 0 for none: then CUDA does, if the network is trained there.
-        mark: fingerprint of what is trained, code included; kept with the result, and no state of another one is taken up.
+        workers: number of CPU processes that sample clouds. With 0, clouds are sampled on the training device.
+        mark: fingerprint of data, settings and code. It is stored with the result, and only a state with the same mark
+            is resumed.
 
     Raises:
-        ConfigError: sets that do not belong together or are too small.
-        TrainingError: a loss that is no number any more, or metrics that the system refuses to write.
-        KeyboardInterrupt: interrupted; the same call goes on from the last saved epoch.
+        ConfigError: the sets do not belong together or are too small.
+        TrainingError: the loss is not finite, or metrics cannot be written.
+        KeyboardInterrupt: Ctrl-C; the same call resumes from the last saved epoch.
     """
     began = time.perf_counter()
     if device == "gpu" and not (torch.cuda.is_available() or torch.backends.mps.is_available()):
@@ -157,7 +158,7 @@ def train_regressor(
     module.network.load_state_dict(recorder.weights)
     network = module.network.to(place)
     regressor = Regressor(told, network)
-    if not isinstance(network, Posterior):  # whose widths are its own
+    if not isinstance(network, Posterior):  # it has its own widths
         spread = _measured(regressor, clouds.test, clouds.validation).in_widths.mean(0)
         regressor = Regressor(told.model_copy(update={"spread": tuple(spread.tolist())}), network)
     summary = {
@@ -194,13 +195,13 @@ def _check_sets(train: SimulatedSet, test: SimulatedSet, settings: TrainingSetti
 
 @dataclass(frozen=True)
 class _Clouds:
-    """The data of one training."""
+    """Data of one training."""
 
     train: CloudDataset
     test: CloudDataset
     background: BackgroundBody | None
     draws: int
-    """Of the training set that are used."""
+    """Number of training samples that are used."""
     validation: list[int]
     held_out: list[int]
 
@@ -215,7 +216,7 @@ class _Clouds:
         body = train.obstacle if settings.subtract_background else None
         described = None if body is None else BackgroundBody.of(body, BACKGROUND_REACH_M / train.length_unit_m)
         background = None if described is None else described.build(device=device)
-        # the test clouds stay the same in all epochs, and have random numbers of their own
+        # the test clouds are the same in all epochs and have their own random numbers
         sets = [
             CloudDataset(
                 simulated,
@@ -234,8 +235,8 @@ class _Clouds:
 
 
 def _centre_and_length(dataset: CloudDataset) -> tuple[tuple[float, float, float], float]:
-    """The mean of some training clouds, and the largest distance from it: scaled clouds fill the unit sphere, for which the
-    published radii are."""
+    """Return the mean of some training clouds, and the largest distance from it. Scaled clouds fill the unit sphere,
+    for which the published radii are meant."""
     clouds, _ = dataset.batch(range(min(_SCALE_SAMPLES, len(dataset))))
     points = clouds.flatten(0, 2).double()
     centre = points.mean(0)
@@ -244,7 +245,7 @@ def _centre_and_length(dataset: CloudDataset) -> tuple[tuple[float, float, float
 
 
 class _Batches(Dataset[tuple[Tensor, Tensor]]):
-    """Whole batches by (epoch, indices)."""
+    """Dataset of whole batches, indexed by (epoch, indices)."""
 
     def __init__(self, dataset: CloudDataset) -> None:
         self.dataset = dataset
@@ -256,14 +257,14 @@ class _Batches(Dataset[tuple[Tensor, Tensor]]):
 
 
 class _Order(Sampler[tuple[int, list[int]]]):
-    """Batches of one epoch. A shuffled epoch drops its incomplete last batch, which would disturb batch normalisation."""
+    """Batches of one epoch. A shuffled epoch drops an incomplete last batch, because of batch normalisation."""
 
     def __init__(self, indices: Sequence[int], batch_size: int, *, shuffle_seed: int | None) -> None:
         self.indices, self.batch_size, self.seed = list(indices), min(batch_size, len(indices)), shuffle_seed
         self.epoch = 0
 
     def set_epoch(self, epoch: int) -> None:
-        """Called by Lightning."""
+        """Set the epoch; Lightning calls this."""
         self.epoch = epoch if self.seed is not None else 0
 
     def __len__(self) -> int:
@@ -279,7 +280,7 @@ class _Order(Sampler[tuple[int, list[int]]]):
 
 
 class _Training(lightning.LightningModule):
-    """Loss and optimiser."""
+    """Lightning module with loss and optimiser."""
 
     def __init__(self, told: Description, settings: TrainingSettings, network: nn.Module) -> None:
         super().__init__()
@@ -322,13 +323,13 @@ class _Training(lightning.LightningModule):
 
 
 def parameter_loss(outputs: Tensor, parameters: Tensor, scale: OutputScale, *, loss: Loss) -> Tensor:
-    """Mean L1 between predicted and true parameters, or its likelihood if the outputs have widths.
+    """Return the mean L1 error of the parameters, or the Laplace negative log-likelihood if the outputs have widths.
 
     Args:
-        outputs: [B, k], or [B, 2k] with logarithms of Laplace widths b: then mean(|error| / b + log b), which is L1 where b
-            is one.
-        parameters: [B, k] linear fractions of the bounds.
-        loss: `normalised` on the scale of the target, `raw` in the parameters' units.
+        outputs: [B, k], or [B, 2k] with logarithms of Laplace widths b. The loss is then mean(|error| / b + log b),
+            which is L1 for b = 1.
+        parameters: [B, k] linear fractions of the range.
+        loss: `normalised` on the target's scale, `raw` in the parameters' units.
     """
     fractions, log_width = split_outputs(outputs, parameters.shape[1])
     true = scale.from_linear(parameters)
@@ -337,7 +338,7 @@ def parameter_loss(outputs: Tensor, parameters: Tensor, scale: OutputScale, *, l
 
 
 class _Recorder(lightning.Callback):
-    """History and best weights; part of the saved state."""
+    """Callback that keeps history and best weights, as part of the saved state."""
 
     def __init__(self, live: Path, progress: Callable[[TrainingProgress], None] | None) -> None:
         self.folder, self.progress = live, progress
@@ -393,20 +394,20 @@ class _Recorder(lightning.Callback):
 
 
 def _metrics_writer(folder: Path) -> Any:
-    """DVCLive's metrics files and nothing else: experiments, dvc.yaml and reports are the project's own."""
+    """Return a DVCLive writer of metrics files only. Experiments, dvc.yaml and reports are handled elsewhere."""
     from dvclive import Live  # type: ignore[attr-defined]  # does not declare what it exports
 
     class Metrics(Live):
         def _init_dvc(self) -> None:
-            # Left out: it opens the Git repository around the current folder without closing it, and makes one that is not
-            # under DVC a DVC repository. The files need neither.
+            # Not called, since the files need no repository. The original opens the Git repository around the current
+            # folder without closing it, and initialises DVC there.
             pass
 
     return Metrics(str(folder), report=None, save_dvc_exp=False, dvcyaml=None)
 
 
 class _Saver(lightning.Callback):
-    """Writes the whole state now and then, so that a kill costs little."""
+    """Callback that saves the whole state at intervals, so that a killed run can be resumed."""
 
     def __init__(self, path: Path) -> None:
         self.path, self.last = path, time.monotonic()
@@ -416,7 +417,7 @@ class _Saver(lightning.Callback):
             self.save(trainer)
 
     def save(self, trainer: lightning.Trainer) -> None:
-        # Lightning writes files only, and in its own way
+        # Lightning can only write to files, and not atomically
         with TemporaryDirectory(prefix="diffcloud-") as folder:
             trainer.save_checkpoint(Path(folder) / "state")
             write_bytes(self.path, (Path(folder) / "state").read_bytes())
@@ -433,20 +434,20 @@ def _fit(
     on_gpu: bool,
     workers: int,
 ) -> int:
-    """Run the epochs; returns how many an earlier run had done."""
+    """Run the epochs. Return the number that an earlier run had completed."""
     earlier = _readable_state(state)
     shuffled = _Order(range(clouds.draws), settings.batch_size, shuffle_seed=settings.seed)
-    shuffled.set_epoch(earlier)  # Lightning, which tells later ones, asks for the first batch before that
+    shuffled.set_epoch(earlier)  # Lightning requests the first batch before it sets the epoch
     in_order = _Order(clouds.validation, settings.batch_size, shuffle_seed=None)
     train, validation = (
-        # a generator of its own: a loader draws a number when it starts, which is not at the same place in a resumed run
+        # own generator, because starting a loader draws a number, which would change a resumed run
         DataLoader(_Batches(dataset), sampler=order, batch_size=None, num_workers=workers, generator=torch.Generator())
         for dataset, order in ((clouds.train, shuffled), (clouds.test, in_order))
     )
     callbacks: list[lightning.Callback] = [recorder]
     if settings.patience is not None:
         callbacks.append(EarlyStopping("validation_loss", patience=settings.patience))
-    callbacks.append(_Saver(state))  # last: what the others know is then in the state
+    callbacks.append(_Saver(state))  # last, so that the state includes the other callbacks
     with _quiet():
         trainer = lightning.Trainer(
             accelerator="gpu" if on_gpu else "cpu",
@@ -464,14 +465,14 @@ def _fit(
         try:
             trainer.fit(module, train, validation, ckpt_path=str(state) if earlier else None, weights_only=True)
         except SystemExit as exit_:
-            # Lightning turns Ctrl-C into an exit, and Ctrl-C off
+            # Lightning turns Ctrl-C into an exit and disables it
             signal.signal(signal.SIGINT, handler)
             raise KeyboardInterrupt from exit_
     return earlier
 
 
 def _readable_state(path: Path) -> int:
-    """Epochs done in a saved state; 0 for none, or one that is damaged and must not stop a training."""
+    """Return the number of completed epochs in a saved state, or 0. A damaged file is deleted."""
     try:
         saved = torch.load(path, map_location="cpu", weights_only=True)
         return int(saved["epoch"]) + 1
@@ -482,7 +483,7 @@ def _readable_state(path: Path) -> int:
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Without Lightning's announcements: the commands have a progress display of their own."""
+    """Suppress Lightning's messages, since the commands have their own progress display."""
     loggers = [logging.getLogger(name) for name in ("lightning.pytorch", "lightning.fabric", "dvclive")]
     levels = [logger.level for logger in loggers]
     for logger in loggers:
@@ -498,10 +499,11 @@ def _quiet() -> Iterator[None]:
 
 
 def _resume_path(out: Path, told: Description, train: SimulatedSet, test: SimulatedSet, made_by: str) -> Path:
-    """A hidden file whose name tells settings and data, so that no training takes up another one's state.
+    """Return the path of the hidden state file. Its name has a hash of settings and data, so that no other state is
+    resumed.
 
     Args:
-        made_by: code and type of processor, which decide the numbers too.
+        made_by: code and type of processor, which affect the numbers too.
     """
     digest = hashlib.sha256((told.model_dump_json() + made_by).encode())
     for array in (train.parameters, train.nodes, test.parameters, test.nodes):
@@ -511,16 +513,16 @@ def _resume_path(out: Path, told: Description, train: SimulatedSet, test: Simula
 
 @dataclass(frozen=True)
 class _Measured:
-    """What is predicted of n draws, beside the truth."""
+    """Predictions for n samples compared with the true values."""
 
     in_widths: Tensor
-    """[n, k] |error| in widths."""
+    """[n, k] absolute errors in widths."""
     off: Tensor
-    """[n, k] values in the parameters' units minus the true ones."""
+    """[n, k] predicted minus true values, in the parameters' units."""
     inside: Tensor
-    """bool [n, L, k] whether intervals of these `LEVELS` hold the truth."""
+    """bool [n, L, k], whether intervals of the L levels in `LEVELS` contain the true value."""
     ranks: Tensor | None
-    """[n, k + 1] of a posterior: the share of draws below the truth, and the share that is denser than it."""
+    """[n, k + 1] for a posterior: fractions of samples below the true values, and of samples with higher density."""
 
 
 def _measured(regressor: Regressor, dataset: CloudDataset, indices: Sequence[int]) -> _Measured:
@@ -548,7 +550,7 @@ def _measured(regressor: Regressor, dataset: CloudDataset, indices: Sequence[int
 
 
 def _held_out(regressor: Regressor, clouds: _Clouds) -> dict[str, Any]:
-    """Errors on the draws that nothing was chosen by, beside those of always predicting the training's mean or median."""
+    """Return held-out errors, and those of constant predictors (mean and median of the training set)."""
     names = regressor.description.names
     measured = _measured(regressor, clouds.test, clouds.held_out)
     off, coverage = measured.off.double().numpy(), measured.inside.double().mean(0).numpy()
@@ -576,9 +578,9 @@ def _held_out(regressor: Regressor, clouds: _Clouds) -> dict[str, Any]:
     if measured.ranks is not None:
         ranks = measured.ranks.double().numpy()
         told["calibration"] = {
-            # of the smallest regions that hold the truth, over all parameters together (Hermans et al. 2022)
+            # coverage of highest-density regions, over all parameters together (Hermans et al. 2022)
             "expected_coverage": [float((ranks[:, -1] <= level).mean()) for level in LEVELS],
-            # simulation-based calibration: ranks of the truth are uniform (Talts et al. 2018), p of Kolmogorov and Smirnov
+            # simulation-based calibration: ranks of the true values are uniform (Talts et al. 2018), KS test
             "uniform_ranks": {name: float(kstest(ranks[:, index], "uniform").pvalue) for index, name in enumerate(names)},
         }
     return told

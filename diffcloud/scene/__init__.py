@@ -1,4 +1,4 @@
-"""Scenes: the built-in scenarios, YAML files that vary them, and scene files, all turned into (System, State)."""
+"""Scenes: built-in scenarios, YAML files that modify them, and scene files. All become (System, State)."""
 
 from diffcloud.scene.description import Scene
 from diffcloud.scene.registry import load_scene

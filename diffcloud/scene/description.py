@@ -1,4 +1,4 @@
-"""A scene in the project's own terms, before it becomes tensors."""
+"""Description of a scene, before it is converted to tensors."""
 
 from __future__ import annotations
 
@@ -19,48 +19,48 @@ from diffcloud.sim.system import State, System
 
 @dataclass(frozen=True)
 class Scene:
-    """One cloth, what holds it, and what surrounds it. Lengths in the scene's own unit."""
+    """One cloth with its handles and surroundings. Lengths are in the scene's own unit."""
 
     mesh: ClothMesh
     material: Material
     handles: Handles
     frame_time: float
-    """[s]"""
+    """Time between frames [s]."""
     frame_steps: int = 1
     end_time: float = math.inf
-    """[s]"""
+    """End of the simulation [s]."""
     surrounding: Surrounding = field(default_factory=Surrounding)
     mass_material: Material | None = None
-    """Gives the node masses where it differs from `material` (see `arcsim.load.load_scene`)."""
+    """Material for the node masses, if it differs from `material` (see `arcsim.load.load_scene`)."""
     integrator: str = "implicit"
-    """A key of `sim.integrators.INTEGRATORS`. "implicit": converged steps with smooth contact and rigid bodies; "arcsim":
-    ARCSim's steps. The one default; scene files of ARCSim and the `release_*` experiments name theirs."""
+    """Key of `sim.integrators.INTEGRATORS`. "implicit": converged steps with smooth contact and rigid bodies. "arcsim":
+    ARCSim's steps, which ARCSim scene files and the `release_*` experiments use."""
     order: Order = 2
-    """Of the implicit integrator: 2, BDF2, or 1, backward Euler, which scenes with rigid bodies always have."""
+    """Order of the implicit integrator: 2 is BDF2, 1 is backward Euler. Scenes with rigid bodies always use 1."""
     shaped: bool = False
-    """Whether the cloth's hinges are at rest as the mesh stands (something sewn or moulded), not flat."""
+    """Whether the rest angles of the hinges are those of the mesh (sewn or moulded) instead of flat."""
 
     @property
     def time_step(self) -> float:
-        """[s]"""
+        """Duration of a simulation step [s]."""
         return self.frame_time / self.frame_steps
 
     @property
     def default_frames(self) -> int | None:
-        """Frames until `end_time`, counted as ARCSim does: the step that reaches it is the last."""
+        """Number of frames until `end_time`, counted like ARCSim: the step that reaches it is the last."""
         if math.isinf(self.end_time):
             return None
         return math.ceil(math.ceil(self.end_time / self.time_step - 1e-9) / self.frame_steps)
 
     @property
     def bodies(self) -> SurfaceMesh:
-        """All static obstacles but the planar ones (tables), as one mesh to draw; without any, no nodes and no faces."""
+        """All static obstacles except planar ones (tables), as one mesh; possibly empty."""
         return SurfaceMesh.joined([obstacle for obstacle in self.surrounding.obstacles if obstacle.plane() is None])
 
     def nominal(self, name: Quantity) -> float:
-        """What multipliers act on, in the scene's units: stiffness at rest in stretching [N/m], in shear divided by
-        that, or in bending [N·m]; density of the cloth or of the air that moves with it [kg/m²], of the air [kg/m³], its
-        linear drag [kg/(m²·s)], mass of all rigid bodies [kg]."""
+        """Return the quantity to which a multiplier refers, in the scene's units. These are stretching stiffness at
+        rest [N/m], shear stiffness divided by it, and bending stiffness [N·m]. Others are density [kg/m²], air density
+        [kg/m³], added mass [kg/m²] and linear drag [kg/(m²·s)] of the air, and the mass of all rigid bodies [kg]."""
         match name:
             case "stretching":
                 return self.material.resting_stretching_stiffness
@@ -80,17 +80,18 @@ class Scene:
                 return float(self.build()[0].properties.body_mass.sum()) if self.surrounding.bodies else 0.0
 
     def stepped(self, integrator: str, order: Order = 2) -> Scene:
-        """The same scene with an integrator and the contact that is its own.
+        """Return the same scene with another integrator and the contact model that belongs to it.
 
         Raises:
-            SceneError: no such integrator.
+            SceneError: the integrator is unknown.
         """
         surrounding = load_integrator(integrator).with_contact(self.surrounding)
         return replace(self, integrator=integrator, order=order, surrounding=surrounding)
 
     def finer(self) -> Scene:
-        """The same scene, each face of the cloth cut into four; its first nodes are those of this one. What lies between
-        two nodes that are held alike is held like them: a pad keeps its size, and a pivot, which `build` scales, too."""
+        """Return the same scene with each face of the cloth divided into four. The first nodes are those of this scene.
+        A new node between two nodes that are held in the same way is held like them. So pads and pivots keep their
+        size."""
         mesh, edges = refined(self.mesh)
         turned = {replace(handle, turned=Handle.turned): handle.turned for handle in self.handles.handles}
         more: list[Handle] = []
@@ -103,7 +104,7 @@ class Scene:
         return replace(self, mesh=mesh, handles=replace(self.handles, handles=(*self.handles.handles, *more)))
 
     def build(self) -> tuple[System, State]:
-        """(System, State at time zero with batch 1)."""
+        """Build the scene: (System, State at time zero with batch size 1)."""
         system = build_system(
             self.mesh,
             self.material,

@@ -1,7 +1,5 @@
-"""What packages above this one bring to scenes: readers of scene files, and experiments whose scene is a file.
-
-Their modules are imported when they are first asked for, so that nothing here depends on them.
-"""
+"""Registry of scene file readers and file-based experiments in packages above this one. Their modules are imported on
+first use, so that this package does not depend on them."""
 
 from __future__ import annotations
 
@@ -22,10 +20,10 @@ EXPERIMENTS = dict.fromkeys(("release_lift", "release_fold", "release_hang", "re
 
 
 def load_scene(path: Path) -> Scene:
-    """Read a scene file with the reader of its suffix.
+    """Read a scene file with the reader for its suffix.
 
     Raises:
-        SceneError, MeshError: a suffix without a reader, or what the reader finds wrong.
+        SceneError, MeshError: there is no reader for the suffix, or the file is invalid.
     """
     suffix = Path(path).suffix
     if suffix not in READERS:
@@ -35,13 +33,13 @@ def load_scene(path: Path) -> Scene:
 
 
 def load_experiment(name: str, path: Path) -> Scenario:
-    """An experiment on its scene file.
+    """Return an experiment with its scene file.
 
     Args:
         name: a key of `EXPERIMENTS`.
 
     Raises:
-        SceneError, MeshError: what is wrong with the file, or that it belongs to another experiment.
+        SceneError, MeshError: the file is invalid or belongs to another experiment.
     """
     experiment: Scenario = import_module(EXPERIMENTS[name]).load_experiment(name, Path(path))
     return experiment

@@ -1,1 +1,1 @@
-"""Recordings of cameras and arm, real and synthetic, and what their clouds need before a fit."""
+"""Recordings of cameras and arm, real and synthetic, and the processing of their clouds before a fit."""

@@ -1,24 +1,25 @@
-"""How two cameras that see one moving cloth disagree: pose, depth scale and clock of the second against the first.
+"""Correction of the second camera against the first (pose, depth scale and clock), from recordings of one moving cloth.
 
-Where both cameras see the same place, a point of one lies on the surface that the other sees. A point q of the second
-camera belongs at
+Points of one camera lie on the surface that the other sees, where both see the same part of the cloth. A point q of the
+second camera is corrected to
 
     q' = m + R(w) (e + exp(s) (q - e) - m) + t
 
-with a rotation vector w and a shift t about the middle m of the clouds, and a scale s about the second camera e. A frame of
-the second camera with time stamp T shows the motion at T + lag on the first camera's clock. Gauss-Newton minimises
-distances along normals, in both directions: from points of one camera to the other's surface at that time. This surface is
-interpolated quadratically between three frames. Weights are Tukey's.
+with a rotation vector w and a shift t about the centre m of the clouds, and a scale s about the second camera e. A
+frame of the second camera with time stamp T shows the motion at T + lag on the first camera's clock. Gauss–Newton
+minimises point-to-plane distances in both directions, from points of one camera to the other's surface at that time.
+The surface is interpolated quadratically between three frames. Outliers get Tukey weights.
 
-Noise of the normals and speeds would look like information: a flat cloth would show a shift in its own plane. So they are
-measured twice, on the surface that a point is compared with (J) and on the point's own surface (Z). Both have the same mean
-and independent noise. Z'J then estimates the information without bias, and Z'r = 0 is solved for the correction
-(instrumental variables, Wooldridge 2010, chapter 5). Directions in which Z'J is as small as noise makes it are not shown.
+Noise of the normals and velocities would look like information. For example, a flat cloth would seem to determine a
+shift in its own plane. So both are measured twice: on the surface that a point is compared with (J), and on the point's
+own surface (Z). They have the same mean and independent noise. Z'J therefore estimates the information without bias,
+and Z'r = 0 is solved for the correction (instrumental variables, Wooldridge 2010, chapter 5). Directions in which Z'J
+is as small as its noise are treated as not identifiable.
 
-Errors of a surface are shared by neighbouring points and frames. Sums over neighbouring frames say how many comparisons
-count as one. The result is the posterior mean with the priors below: what the recording hardly shows stays near zero, and
-keeps the prior's standard deviation. A flat cloth shows neither a shift in its plane nor a turn in it, and a cloth at rest
-does not show the lag.
+Surface errors are correlated between neighbouring points and frames. Sums over neighbouring frames estimate the
+effective number of comparisons. The result is the posterior mean with the priors below. Directions with little
+information stay near zero and keep the prior's standard deviation. A flat cloth does not determine an in-plane shift or
+rotation, and a cloth at rest does not determine the lag.
 """
 
 from __future__ import annotations
@@ -39,41 +40,41 @@ from diffcloud.sensing.robust import deviation, tukey
 Floats = NDArray[np.float64]
 
 _PRIORS = np.array([np.radians(5.0)] * 3 + [0.05] * 3 + [0.03, 0.1])
-"""Standard deviations of w [rad], t [m], s [1] and lag [s] before the recording was seen."""
+"""Prior standard deviations of w [rad], t [m], s [1] and lag [s]."""
 _SHOWN = 0.5
-"""A direction is shown if its information exceeds this part of what noise of the normals would leave of it if all points
-of a frame shared their noise. Noise alone reaches 0.2."""
+"""A direction is identifiable if its information exceeds this multiple of its noise. The noise assumes that all points
+of a frame share their error. Noise alone reaches 0.2."""
 _VOXEL_M = 0.006
-"""Points are averaged in voxels of this side, so that both cameras' surfaces are equally smooth."""
+"""Side of the voxels in which points are averaged [m], so that both cameras' surfaces are equally smooth."""
 _NEIGHBOURS = 40
 _SPREAD_M = 0.025
-"""The neighbours that define a normal lie within this radius; sparser places belong to no surface."""
+"""Maximum radius of the neighbours for a normal [m]. Points in sparser regions are dropped."""
 _BORDER = 0.25
-"""A place farther from the mean of its neighbours than this part of their radius is at a border. Its height and normal have
-common noise."""
+"""A point is at a border if its distance from the mean of its neighbours exceeds this fraction of their radius. Such
+points are dropped, since the errors of their height and normal are correlated."""
 _EDGE_M = 0.006
-"""Beside the nearest point of a surface by more than this, a point is beyond its edge."""
+"""Maximum tangential distance from the nearest surface point [m]; beyond, a point is outside the surface."""
 _ALIKE = 0.85
-"""Cosine between the normals of surfaces that may be the same one."""
+"""Minimum cosine between normals for two surfaces to match."""
 _REACH_M = 0.06
-"""In the frames before and after, a surface may be so far away."""
+"""Maximum distance between a point and the other surface in the adjacent frames [m]."""
 _GATE_M = 0.02
-"""Points farther from the surface show something else."""
+"""Points farther from the surface are excluded [m]."""
 _FIRST_GATES_M = (0.06, 0.06, 0.05, 0.04, 0.03, 0.03)
-"""Of the first iterations, in place of that."""
+"""Larger limits for the first iterations [m]."""
 _ITERATIONS = 30
 _CONVERGED = 0.002
-"""A step this small, in standard deviations of the priors, is the last one."""
+"""The iteration ends if the step is smaller than this, in standard deviations of the priors."""
 _SHARED_FRAMES = 3
-"""Frames next to one another that are compared with the same surfaces."""
+"""Number of adjacent frames with correlated errors, because they are compared with the same surfaces."""
 _CLOCK_BIAS_S = 0.02
-"""Added to the standard deviation of a clock. Depth errors that this model lacks act on the offset too: on the published
-recordings, estimates with other weights and surfaces differ by about as much."""
+"""Additional standard deviation of a clock [s], for depth errors that this model lacks. On the published recordings,
+estimates with other weights and surfaces differ by about this much."""
 _UNKNOWN_CLOCK_S = 0.1
 _SOURCES = 300
-"""Points of each camera and frame that are compared."""
+"""Number of points of each camera and frame that are compared."""
 _LEAST_ROWS, _LEAST_FRAMES = 300, 5
-"""Fewer compared points or frames show no agreement."""
+"""Minimum number of compared points and frames."""
 
 
 @dataclass(frozen=True)
@@ -81,44 +82,44 @@ class Agreement:
     """Correction of the second camera, to be applied to its points."""
 
     cameras: tuple[str, str]
-    """Names of the first camera, which stays, and of the second."""
+    """Names of the first camera, which is unchanged, and of the second."""
     middle: Floats
-    """[3] about which it is turned [m]."""
+    """[3] centre of the rotation [m]."""
     eye: Floats
-    """[3] about which it is scaled [m]: the second camera."""
+    """[3] centre of the scaling [m], i.e. the second camera's position."""
     values: Floats
-    """[8] w [rad], t [m], s, lag [s]; zero in directions that the recordings do not show."""
+    """[8] w [rad], t [m], s, lag [s]; zero in directions that are not identifiable."""
     covariance: Floats
-    """[8, 8] of the values. Directions that the recordings do not show keep the prior's. The prior's mean is zero."""
+    """[8, 8] covariance of the values. Directions that are not identifiable keep that of the prior."""
     before_m: float
     after_m: float
-    """Root mean square distances of points to the other camera's surface, without and with the correction [m]; NaN if no
-    point is near it."""
+    """RMS distances from points to the other camera's surface, before and after the correction [m]; NaN without
+    points."""
 
     @property
     def sigmas(self) -> Floats:
-        """[8] standard deviations."""
+        """[8] standard deviations of the values."""
         return np.sqrt(np.diag(self.covariance))
 
     def moved(self, points: Floats) -> Floats:
-        """[N, 3] points of the second camera -> where they belong [m]."""
+        """Apply the correction to points [N, 3] of the second camera [m]."""
         return self._matrix(points - self.eye) + self._shift()
 
     def pinhole(self, seen: Pinhole) -> Pinhole:
-        """The second camera with its corrected pose. A scale of depths moves no pixel, so it is left out."""
+        """Return the second camera's model with corrected pose. The depth scale does not affect pixels."""
         T = seen.T_camera_scene
         R = T[:, :3] @ self._rotation().T
         return replace(seen, T_camera_scene=np.column_stack([R, -R @ self.moved(seen.position[None])[0]]))
 
     def plane(self, plane: Sequence[float]) -> list[float]:
-        """[a, b, c, d]: half space a x + b y + c z >= d of the second camera's points, after the correction."""
+        """Apply the correction to a half space a x + b y + c z >= d of the second camera's points."""
         normal, offset = np.array(plane[:3]), plane[3]
         on = self.moved((offset * normal / (normal @ normal))[None])[0]
         turned = self._rotation() @ normal
         return [*turned.tolist(), float(turned @ on)]
 
     def described(self) -> dict[str, Any]:
-        """For metadata, in SI."""
+        """Return the correction as metadata in SI units."""
         names = ("rotation_rad", "translation_m", "log_scale", "clock_offset_s")
         parts: tuple[slice | int, ...] = (slice(0, 3), slice(3, 6), 6, 7)
         return {
@@ -138,26 +139,26 @@ class Agreement:
         return np.asarray(np.exp(self.values[6]) * vectors @ self._rotation().T)
 
     def _shift(self) -> Floats:
-        """[3] where the second camera itself belongs."""
+        """Return the corrected position [3] of the second camera."""
         return np.asarray(self.middle + self._rotation() @ (self.eye - self.middle) + self.values[3:6])
 
     def back(self, points: Floats) -> Floats:
-        """The inverse of `moved`."""
+        """Apply the inverse of `moved`."""
         return np.asarray(self.eye + np.exp(-self.values[6]) * (points - self._shift()) @ self._rotation())
 
 
 @dataclass(frozen=True)
 class _Surface:
-    """What one camera saw in one frame."""
+    """Surface that one camera saw in one frame."""
 
     points: Floats
-    """[N, 3] moved onto the planes through their neighbours."""
+    """[N, 3] points, projected onto the planes through their neighbours."""
     normals: Floats
     tree: cKDTree | None
 
     @staticmethod
     def of(points: Floats, eye: Floats) -> _Surface:
-        """Of points [N, 3] seen from a place [3]; normals point towards it."""
+        """Return the surface of points [N, 3] seen from a camera position [3], with normals towards the camera."""
         points = _thinned(points)
         if len(points) < 2 * _NEIGHBOURS:
             return _Surface(np.empty((0, 3)), np.empty((0, 3)), None)
@@ -173,8 +174,9 @@ class _Surface:
         return _Surface(own, normal, cKDTree(own) if len(own) else None)
 
     def height(self, points: Floats, facing: Floats) -> tuple[Floats, Floats]:
-        """Height [N] of points above the surface along its normals [N, 3]; NaN where no surface faces the same
-        way as the points' own surface does [N, 3]: cloth has two sides, and folds have layers."""
+        """Return signed distances [N] of points above the surface, and the surface normals [N, 3]. A distance is NaN if
+        no nearby surface has about the normal `facing` [N, 3]. This separates the two sides of the cloth and the layers
+        of a fold."""
         height, normal = np.full(len(points), np.nan), np.zeros((len(points), 3))
         if self.tree is None or not len(points):
             return height, normal
@@ -189,7 +191,7 @@ class _Surface:
 
 
 def _thinned(points: Floats) -> Floats:
-    """The mean of the points [N, 3] in each voxel, [V, 3]."""
+    """Return the mean [V, 3] of the points [N, 3] in each voxel."""
     cell = np.floor(points / _VOXEL_M).astype(np.int64)
     _, voxel, count = np.unique(cell, axis=0, return_inverse=True, return_counts=True)
     total = np.zeros((len(count), 3))
@@ -200,25 +202,25 @@ def _thinned(points: Floats) -> Floats:
 @dataclass(frozen=True)
 class _Rows:
     J: Floats
-    """[N, 8] by the normals and speeds of the surface that a point is compared with."""
+    """[N, 8] derivatives, with normals and velocities of the surface that a point is compared with."""
     Z: Floats
-    """[N, 8] by those of the point's own surface."""
+    """[N, 8] derivatives, with normals and velocities of the point's own surface."""
     r: Floats
-    """[N] [m]."""
+    """[N] residuals [m]."""
     frame: NDArray[np.int64]
-    """[N] numbers of the frames."""
+    """[N] frame numbers."""
 
 
 @dataclass(frozen=True)
 class _Pair:
-    """One recording of two cameras."""
+    """One recording by two cameras."""
 
     times: Floats
     surfaces: tuple[list[_Surface], list[_Surface]]
     sources: tuple[list[NDArray[np.int64]], list[NDArray[np.int64]]]
-    """Points of these surfaces that are compared with the other camera's."""
+    """Indices of the points of these surfaces that are compared with the other camera's surface."""
     rates: tuple[list[Floats], list[Floats]]
-    """[N] of each source, how fast its own surface moves against its normal [m/s]; NaN where that is not seen."""
+    """[N] rate of the distance to the moving own surface, for each compared point [m/s]; NaN if unknown."""
 
     @staticmethod
     def of(episode: Episode, numbers: tuple[int, int], rng: np.random.Generator) -> _Pair:
@@ -241,7 +243,7 @@ class _Pair:
         return _Pair(episode.times, (surfaces[0], surfaces[1]), (sources[0], sources[1]), (rates[0], rates[1]))
 
     def rows(self, now: Agreement, gate: float, first: int) -> list[_Rows]:
-        """Of every frame in both directions; frames are numbered from `first`."""
+        """Return the residuals of all frames in both directions. Frames are numbered from `first`."""
         found, lag, back = list[_Rows](), float(now.values[7]), now._rotation()
         for frame, time in enumerate(self.times):
             for to in (0, 1):  # from the second camera's points to the first one's surface, and the other way
@@ -259,7 +261,7 @@ class _Pair:
                 world, r = world[good], height[good]
                 columns = []
                 for n, speed in ((normal[good], rate[good]), (facing[good], own_rate[good])):
-                    # the second camera's surface goes along with its correction, its point's height goes the other way
+                    # the correction moves the second camera's surface, or its points, so the sign depends on the direction
                     turned, scaled = np.cross(world - now.middle - now.values[3:6], n), world - now._shift()
                     columns.append(sign * np.column_stack([turned, n, (scaled * n).sum(-1), speed]))
                 found.append(_Rows(columns[0], columns[1], r, np.full(len(r), first + frame)))
@@ -269,8 +271,8 @@ class _Pair:
 def _against(
     surfaces: Sequence[_Surface], times: Floats, time: float, points: Floats, facing: Floats
 ) -> tuple[Floats, Floats, Floats]:
-    """Heights [N] of points [N, 3] above a moving surface at a time [m], how fast they grow [m/s], and its normals [N, 3].
-    Heights are NaN outside of the recording, and where `_Surface.height` is."""
+    """Return heights [N] of points [N, 3] above a moving surface at a time [m], their rates [m/s], and normals [N, 3].
+    Heights are NaN outside the recording and where `_Surface.height` is."""
     between = _between(times, time)
     height, rate, normal = np.zeros(len(points)), np.zeros(len(points)), np.zeros((len(points), 3))
     if between is None or not len(points):
@@ -284,7 +286,8 @@ def _against(
 
 
 def _between(times: Floats, time: float) -> list[tuple[int, float, float]] | None:
-    """Three frames with the weights that interpolate at a time, and their slopes [1/s]; None outside of the recording."""
+    """Return three frames with interpolation weights at a time and their derivatives [1/s]; None outside the
+    recording."""
     middle = int(np.abs(times - time).argmin())
     if not 0 < middle < len(times) - 1:
         return None
@@ -310,14 +313,14 @@ def agreement(episodes: Sequence[Episode], cameras: tuple[str, str], *, scale: b
     """Estimate the second camera's correction from all recordings of one set-up.
 
     Args:
-        episodes: in metres, each with `camera` of its points, and `cameras` and `viewpoints` in its meta.
-        cameras: names of the first, which stays, and of the second.
-        scale: whether the second camera's depths may have a wrong scale.
-        seed: of the points that are compared.
+        episodes: recordings in metres, each with `camera` of its points, and with `cameras` and `viewpoints` in meta.
+        cameras: names of the first camera, which is unchanged, and of the second.
+        scale: whether to estimate a depth scale of the second camera.
+        seed: seed for the choice of the compared points.
 
     Raises:
-        EpisodeError: points that name no camera, an unknown camera, one that was corrected before, or surfaces that do not
-            overlap enough to be compared.
+        EpisodeError: points do not name their camera, a camera is unknown or was corrected before, or the surfaces do
+            not overlap enough.
     """
     rng, pairs = np.random.default_rng(seed), list[_Pair]()
     for episode in episodes:
@@ -359,9 +362,9 @@ def agreement(episodes: Sequence[Episode], cameras: tuple[str, str], *, scale: b
 
 
 def _stepped(now: Agreement, rows: _Rows, free: NDArray[np.int64]) -> Agreement:
-    """After one Gauss-Newton step towards the posterior mean."""
+    """Take one Gauss–Newton step towards the posterior mean."""
     weight = tukey(rows.r, _sigma(rows))
-    J, Z = rows.J[:, free] * _PRIORS[free], rows.Z[:, free] * _PRIORS[free]  # in deviations of the priors
+    J, Z = rows.J[:, free] * _PRIORS[free], rows.Z[:, free] * _PRIORS[free]  # in standard deviations of the priors
     shown = _shown(J, Z, weight, len(np.unique(rows.frame)))
     hidden = np.eye(len(free)) - shown @ shown.T
     J, Z = J @ shown, weight[:, None] * (Z @ shown)
@@ -373,12 +376,12 @@ def _stepped(now: Agreement, rows: _Rows, free: NDArray[np.int64]) -> Agreement:
     step, covariance = np.zeros(8), np.eye(8)
     step[free] = -shown @ posterior @ (gain @ scores.sum(axis=0) + shown.T @ values) - hidden @ values
     covariance[np.ix_(free, free)] = shown @ posterior @ shown.T + hidden
-    # about the middle, small steps add to the rotation vector
+    # small rotation steps are added to the rotation vector
     return replace(now, values=now.values + _PRIORS * step, covariance=_PRIORS[:, None] * covariance * _PRIORS)
 
 
 def _shown(J: Floats, Z: Floats, weight: Floats, frames: int) -> Floats:
-    """[D, d] orthonormal directions in which J [N, D] and Z [N, D] have more in common than noise."""
+    """Return the orthonormal directions [D, d] in which the common part of J [N, D] and Z [N, D] exceeds the noise."""
     information = Z.T @ (weight[:, None] * J)
     ways = np.linalg.eigh(information + information.T)[1]
     common, of_J, of_Z = (weight @ (a @ ways * (b @ ways)) for a, b in ((J, Z), (J, J), (Z, Z)))
@@ -387,7 +390,7 @@ def _shown(J: Floats, Z: Floats, weight: Floats, frames: int) -> Floats:
 
 
 def _counted_as_one(scores: Floats, group: NDArray[np.int64]) -> float:
-    """How many rows of scores [N, d] count as one, because rows of one group [N] share their errors."""
+    """Return the number of rows of scores [N, d] per independent one. Rows of one group [N] have correlated errors."""
     sums = np.zeros((int(group.max()) + 1, scores.shape[1]))
     np.add.at(sums, group, scores)
     sums = sums[np.unique(group)]
@@ -397,7 +400,7 @@ def _counted_as_one(scores: Floats, group: NDArray[np.int64]) -> float:
 
 
 def _sigma(rows: _Rows) -> float:
-    """Standard deviation of the distances [m], from their median."""
+    """Return a robust standard deviation of the distances [m]."""
     return max(deviation(rows.r), 1e-5)
 
 
@@ -406,16 +409,16 @@ def _rms(rows: _Rows) -> float:
 
 
 def corrected(episode: Episode, found: Agreement, recordings: Sequence[str]) -> Episode:
-    """The episode with the second camera's points, pose and cut plane corrected.
+    """Apply a correction to the second camera's points, pose and crop plane in an episode.
 
     Args:
-        recordings: names of those that the correction was estimated from, for its metadata.
+        recordings: names of the recordings from which the correction was estimated, for the metadata.
 
     Returns:
-        Its meta has `agreement`, the correction, and `clocks`: camera -> `offset_s` and `sigma_s` [s]. A point of the
-        second camera with time stamp T shows the motion at T + offset_s on the first camera's clock. The offset of this
-        clock against the gripper's track stays as the recording states it. If the recording states nothing, it is zero,
-        with a wide standard deviation. Times remain as they were.
+        An episode whose meta has `agreement`, the correction, and `clocks`: camera -> `offset_s` and `sigma_s` [s]. A
+            point of the second camera with time stamp T shows the motion at T + offset_s on the first camera's clock.
+            The first camera's offset relative to the gripper's track is unchanged. If the recording states none, it is
+            zero with a large standard deviation. Times are unchanged.
     """
     assert episode.camera is not None
     meta, (first, camera) = dict(episode.meta), found.cameras

@@ -1,7 +1,5 @@
-"""An arm as cameras would see it, which is not as its description says: rounder, a little larger, with a cable on it.
-
-Masks are made from the description. An arm that is rendered from the same description would flatter them.
-"""
+"""Realistic arm surfaces for rendering, which differ from the robot model: rounder, slightly larger, with a cable.
+Masks are made from the robot model. Rendering the same model would make them look too good."""
 
 from __future__ import annotations
 
@@ -26,7 +24,7 @@ from diffcloud.sensing.robot import Robot
 Floats = NDArray[np.float64]
 
 _ROUNDING = 0.3
-"""Radius of rounded edges, as a part of a body's least extent."""
+"""Radius of rounded edges, as a fraction of a body's smallest extent."""
 _LARGEST_ROUNDING_M = 0.006
 _CABLE_RADIUS_M = 0.003
 _CABLE_SIDES = 8
@@ -42,15 +40,13 @@ _GEN3_CABLE = (
     ("bracelet_link", (0.043, 0.0, -0.033)),
     ("robotiq_arg2f_base_link", (0.042, 0.0, 0.03)),
 )
-"""Where ties hold the cable: (link, place in its frame)."""
+"""Fixing points of the cable: (link, position in its frame)."""
 
 
 def lookalike(robot: Robot, rng: np.random.Generator, *, largest_growth_m: float = 0.003) -> Robot:
-    """The robot with every convex part of its links rounded at the edges, and grown by up to `largest_growth_m`.
-
-    Each part is replaced by the set of points within a radius of its inside: the part, moved inwards by the rounding, plus
-    a ball of rounding and growth. Growth is drawn for each part.
-    """
+    """Return the robot with every convex part of its links rounded at the edges and grown by up to `largest_growth_m`.
+    Each part is moved inwards by the rounding radius, then expanded by a ball of radius rounding plus growth. The
+    growth of each part is random."""
     meshes = {
         name: joined([_rounded(part, rng.uniform(0.0, largest_growth_m)) for part in _parts(mesh)])
         for name, mesh in robot.description.meshes.items()
@@ -59,13 +55,13 @@ def lookalike(robot: Robot, rng: np.random.Generator, *, largest_growth_m: float
 
 
 def cable(robot: Robot, poses: Floats) -> SurfaceMesh:
-    """The cable of a Gen3 with a 2F-85, tied to its links, in the world.
+    """Return the cable of a Gen3 with a 2F-85, fixed to its links, in the world.
 
     Args:
         poses: [L, 4, 4] T_world_link.
 
     Raises:
-        RobotError: the robot lacks a link that the cable is tied to.
+        RobotError: the robot lacks a link to which the cable is fixed.
     """
     missing = sorted({link for link, _ in _GEN3_CABLE} - set(robot.links))
     if missing:
@@ -77,7 +73,7 @@ def cable(robot: Robot, poses: Floats) -> SurfaceMesh:
 
 
 def _parts(mesh: LinkMesh) -> Iterator[LinkMesh]:
-    """The connected pieces of a mesh."""
+    """Yield the connected parts of a mesh."""
     count = len(mesh.vertices)
     ends = mesh.faces[:, [0, 1, 1, 2]].reshape(-1, 2)
     graph = coo_array((np.ones(len(ends)), (ends[:, 0], ends[:, 1])), shape=(count, count))
@@ -100,7 +96,7 @@ def _rounded(part: LinkMesh, growth_m: float) -> LinkMesh:
 
 
 def _ball() -> Floats:
-    """[42, 3] unit vectors spread evenly."""
+    """Return 42 evenly spread unit vectors [42, 3]."""
     index = np.arange(42) + 0.5
     z, turn = 1 - 2 * index / 42, np.pi * (1 + 5**0.5) * index
     ring = np.sqrt(1 - z**2)

@@ -1,9 +1,9 @@
-"""Pixels, rays and points of a pinhole camera with Brown–Conrady distortion, or of a fisheye.
+"""Projection of a pinhole camera with Brown–Conrady distortion, or of a fisheye camera.
 
-The camera's frame is OpenCV's: x right, y down, z forward; pixel centres at whole numbers. Two conventions of the same
-polynomial are met: OpenCV's `brown_conrady` maps ideal to distorted coordinates, librealsense's `inverse_brown_conrady`
-distorted to ideal ones. Either way one direction is closed and the other is found by fixed-point iteration. OpenCV's
-`equidistant` bends the angle to the optical axis, by a polynomial from ideal to distorted angles.
+The camera's frame is OpenCV's: x right, y down, z forward, with pixel centres at whole numbers. There are two
+conventions for the same polynomial. OpenCV's `brown_conrady` maps ideal to distorted coordinates, and librealsense's
+`inverse_brown_conrady` maps distorted to ideal ones. One direction is in closed form, the other uses fixed-point
+iteration. OpenCV's `equidistant` is a polynomial from ideal to distorted angles to the optical axis.
 """
 
 from __future__ import annotations
@@ -17,15 +17,15 @@ from diffcloud.io.camera_models import Intrinsics
 Floats = NDArray[np.float64]
 
 _ITERATIONS = 30
-"""Of the fixed point; lenses of depth cameras converge to 1e-12 px in about ten."""
+"""Number of fixed-point iterations. Lenses of depth cameras converge to 1e-12 px in about ten."""
 
 
 _WIDEST_RAD, _LEAST_SLOPE = np.deg2rad(89.9), 1e-3
-"""Rays through a fisheye's pixels stay in front of the camera. Newton's steps stay finite where the polynomial is flat."""
+"""Fisheye limits: rays stay in front of the camera, and Newton steps are finite for a flat polynomial."""
 
 
 def project(points: Floats, intrinsics: Intrinsics) -> Floats:
-    """Pixels [..., 2] (column, row) of camera points [..., 3] [m]."""
+    """Project camera points [..., 3] [m] to pixels [..., 2] (column, row)."""
     ideal = points[..., :2] / points[..., 2:]
     if intrinsics.distortion == "brown_conrady":
         ideal = _polynomial(ideal, intrinsics.coefficients)
@@ -37,7 +37,7 @@ def project(points: Floats, intrinsics: Intrinsics) -> Floats:
 
 
 def rays(pixels: Floats, intrinsics: Intrinsics) -> Floats:
-    """Rays [..., 3] with z = 1 through pixels [..., 2]: times the depth they are camera points."""
+    """Return rays [..., 3] with z = 1 through pixels [..., 2]. Multiplied by depth they are camera points."""
     plane = (pixels - [intrinsics.cx, intrinsics.cy]) / [intrinsics.fx, intrinsics.fy]
     if intrinsics.distortion == "brown_conrady":
         plane = _invert(plane, intrinsics.coefficients)
@@ -51,7 +51,7 @@ def rays(pixels: Floats, intrinsics: Intrinsics) -> Floats:
 def depth_points(
     depth: NDArray[np.uint16], intrinsics: Intrinsics, depth_scale_m: float, *, step: int = 1
 ) -> tuple[Floats, NDArray[np.int64]]:
-    """Camera points [P, 3] [m] and their pixels [P, 2] of every `step`-th valid measurement of a depth image [H, W]."""
+    """Return camera points [P, 3] [m] and pixels [P, 2] of every `step`-th valid pixel of a depth image [H, W]."""
     row, column = np.nonzero(depth[::step, ::step])
     pixels = np.column_stack([column, row]) * step
     z = depth[pixels[:, 1], pixels[:, 0]] * depth_scale_m
@@ -59,7 +59,7 @@ def depth_points(
 
 
 def transform(matrix: Floats, points: Floats) -> Floats:
-    """Rigid transforms [..., 4, 4] of points [..., P, 3]."""
+    """Apply rigid transforms [..., 4, 4] to points [..., P, 3]."""
     moved = rotate(matrix, points)
     for axis in range(3):  # numpy is slow where the last axis is short
         moved[..., axis] += matrix[..., None, axis, 3]
@@ -67,13 +67,13 @@ def transform(matrix: Floats, points: Floats) -> Floats:
 
 
 def rotate(matrix: Floats, vectors: Floats) -> Floats:
-    """Directions [..., P, 3] turned by rigid transforms [..., 4, 4]."""
-    rotated: Floats = vectors @ np.ascontiguousarray(np.swapaxes(matrix[..., :3, :3], -1, -2))  # else not by BLAS
+    """Rotate directions [..., P, 3] by rigid transforms [..., 4, 4]."""
+    rotated: Floats = vectors @ np.ascontiguousarray(np.swapaxes(matrix[..., :3, :3], -1, -2))  # for BLAS
     return rotated
 
 
 def looking_at(position: ArrayLike, target: ArrayLike) -> Floats:
-    """[4, 4] T_world_camera of an upright camera at `position` [3] that looks at `target` [3] [m]."""
+    """Return T_world_camera [4, 4] of an upright camera at `position` [3] that looks at `target` [3] [m]."""
     forward = np.subtract(target, position)
     forward = forward / np.linalg.norm(forward)
     right = np.cross(forward, [0.0, 0.0, 1.0])
@@ -85,7 +85,7 @@ def looking_at(position: ArrayLike, target: ArrayLike) -> Floats:
 
 
 def inverse(matrix: Floats) -> Floats:
-    """Inverse of rigid transforms [..., 4, 4]."""
+    """Invert rigid transforms [..., 4, 4]."""
     result = np.zeros_like(matrix)
     rotation = np.swapaxes(matrix[..., :3, :3], -1, -2)
     result[..., :3, :3] = rotation
@@ -128,7 +128,7 @@ def _terms(xy: Floats, coefficients: tuple[float, ...]) -> tuple[Floats, Floats]
 
 
 def _tilt(coefficients: tuple[float, ...]) -> Floats:
-    """[3, 3] from the plane of an upright sensor to that of one tilted about x, then y (OpenCV's tau_x, tau_y [rad])."""
+    """Return the homography [3, 3] to a sensor tilted about x, then y (OpenCV's tau_x, tau_y [rad])."""
     x, y = coefficients[12:14] or (0.0, 0.0)
     turn = Rotation.from_euler("xy", [-x, -y]).as_matrix()
     onto = np.array([[turn[2, 2], 0, -turn[0, 2]], [0, turn[2, 2], -turn[1, 2]], [0, 0, 1]])
@@ -151,7 +151,7 @@ def _fisheye(xy: Floats, coefficients: tuple[float, ...]) -> Floats:
 def _unfisheye(xy: Floats, coefficients: tuple[float, ...]) -> Floats:
     bent = np.linalg.norm(xy, axis=-1, keepdims=True)
     angle = bent.clip(0, _WIDEST_RAD)
-    for _ in range(_ITERATIONS):  # Newton's
+    for _ in range(_ITERATIONS):  # Newton's method
         angle = (angle - (_bent(angle, coefficients) - bent) / _slope(angle, coefficients)).clip(0, _WIDEST_RAD)
     return np.asarray(xy * np.where(bent > 0, np.tan(angle) / np.where(bent > 0, bent, 1), 1))
 

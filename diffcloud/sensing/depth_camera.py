@@ -1,9 +1,9 @@
-"""A stereo depth camera that looks at a rendered scene: what an Intel RealSense D435 would have made of true depth.
+"""Model of a stereo depth camera (Intel RealSense D435): measured depth from true depth.
 
-Images are depth aligned to colour, as captures are. The camera measures disparity d = f · baseline / z with its two
-infrared imagers, which stand beside the colour camera; so the deviation of depth grows with z², depth comes in steps of
-a part of a pixel, and what only one imager sees has no depth. f is the imagers' own focal length, whatever the size of
-the image.
+Images are depth aligned to colour, like real captures. The camera measures disparity d = f · baseline / z with its two
+infrared imagers, which are beside the colour camera. So the standard deviation of depth grows with z², depth is
+quantised by subpixel steps, and points that only one imager sees have no depth. f is the imagers' own focal length,
+independent of the image size.
 """
 
 from __future__ import annotations
@@ -24,62 +24,63 @@ Floats = NDArray[np.float64]
 
 DEPTH_SCALE_M = 0.001
 _EDGE_M = 0.02
-"""Neighbouring pixels that differ by more are a border."""
+"""Neighbouring pixels are a border if their depths differ by more than this [m]."""
 _HOLE_RADIUS_PX = 2.0
 _COLOR_FOCAL = 614.9 / 480
-"""Focal length of a D435's colour camera in heights of the image (of the published calibration)."""
+"""Focal length of a D435's colour camera in image heights (from the published calibration)."""
 
 
 @dataclass(frozen=True)
 class DepthNoise:
-    """What goes wrong in stereo matching."""
+    """Parameters of stereo matching errors."""
 
     subpixel_px: float = 0.08
     """Standard deviation of the disparity, in pixels of the imagers."""
     correlation_px: float = 0.7
-    """Matching windows overlap: the disparity's errors are smoothed by a Gaussian of this width, at equal deviation."""
+    """Correlation length of the disparity errors, because matching windows overlap. White noise is smoothed by a
+    Gaussian of this width, and its standard deviation is kept."""
     step_px: float = 1 / 32
-    """Disparity is a whole multiple of this."""
+    """Quantisation of the disparity."""
     focal_px: float = 425.0
-    """Of the imagers, at 848 columns."""
+    """Focal length of the imagers, at 848 columns."""
     baseline_m: float = 0.05
     edge_dropout: float = 0.3
-    """Part of the border pixels without depth."""
+    """Fraction of the border pixels without depth."""
     flying: float = 0.1
-    """Part of the border pixels that land between foreground and background."""
+    """Fraction of the border pixels with a depth between foreground and background."""
     holes: float = 0.005
-    """Part of the image in patches without depth, wherever they fall."""
+    """Fraction of the image in random patches without depth."""
     nearest_m: float = 0.2
     farthest_m: float = 4.0
 
     def sigma_m(self, depth_m: Floats) -> Floats:
-        """Standard deviation of depth [m]: σ_z = z² σ_d / (f · baseline)."""
+        """Return the standard deviation of depth [m]: σ_z = z² σ_d / (f · baseline)."""
         return depth_m**2 * self.subpixel_px / (self.focal_px * self.baseline_m)
 
 
 @dataclass(frozen=True)
 class DepthCamera:
-    """A camera in its place, and its faults."""
+    """A depth camera with its pose and errors."""
 
     name: str
     serial: str
     view: View
-    """Where it truly stands."""
+    """True pose and intrinsics."""
     noise: DepthNoise = DepthNoise()
     imager_offsets_m: tuple[float, ...] = (0.015, 0.065)
-    """The infrared imagers' places along the image's x [m]."""
+    """Positions of the infrared imagers along the image's x [m]."""
 
     def info(self, stated: Floats | None = None) -> CameraInfo:
-        """camera.json; `stated` [4, 4] is where the calibration puts the camera, by default where it stands."""
+        """Return the content of camera.json. `stated` [4, 4] is the calibrated pose; by default the true one."""
         pose = self.view.T_world_camera if stated is None else stated
         return CameraInfo(self.name, self.serial, self.view.intrinsics, DEPTH_SCALE_M, pose)
 
     def measure(self, depth_m: Floats, hidden: NDArray[np.bool_], rng: np.random.Generator) -> NDArray[np.uint16]:
-        """The depth image [H, W] in millimetres, 0 where there is none.
+        """Return the depth image [H, W] in millimetres; 0 is no measurement.
 
         Args:
-            depth_m: [H, W] true z-depth; infinite where nothing is.
-            hidden: [H, W] what an imager does not see.
+            depth_m: [H, W] true z-depth; infinite for background.
+            hidden: [H, W] pixels that are occluded from an imager.
         """
         noise = self.noise
         seen = np.isfinite(depth_m) & (depth_m > noise.nearest_m) & (depth_m < noise.farthest_m)
@@ -101,7 +102,7 @@ class DepthCamera:
 
 
 def published_cameras(width: int = 424, height: int = 240, *, noise: DepthNoise | None = None) -> tuple[DepthCamera, ...]:
-    """An overhead and a side camera where those of the published recordings stood; depth is aligned to colour."""
+    """Return an overhead and a side camera with the poses of the published recordings; depth is aligned to colour."""
     intrinsics = color_intrinsics(width, height)
     places = {
         "overhead": ("036522070001", (1.2477, 0.0431, 0.9373), (-0.573, 0.006, -0.819)),
@@ -119,13 +120,13 @@ def published_cameras(width: int = 424, height: int = 240, *, noise: DepthNoise 
 
 
 def color_intrinsics(width: int, height: int) -> Intrinsics:
-    """Of a D435's colour camera: images of all shapes are cut from the full height."""
+    """Return the intrinsics of a D435's colour camera. Images of all aspect ratios use the full height."""
     focal = _COLOR_FOCAL * height
     return Intrinsics(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)
 
 
 def _smooth(rng: np.random.Generator, shape: tuple[int, ...], width_px: float) -> Floats:
-    """[H, W] normal noise of unit variance, smoothed."""
+    """Return smoothed normal noise [H, W] of unit variance."""
     white = rng.standard_normal(shape)
     if width_px <= 0:
         return white

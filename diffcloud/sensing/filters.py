@@ -1,4 +1,4 @@
-"""Cleaning a merged cloud: crop, outliers, thinning."""
+"""Filters for a merged cloud: crop, outlier removal, downsampling."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from diffcloud.io.clouds import import_open3d
 from diffcloud.io.episodes import Episode
 
 Downsampling = Literal["random", "voxel", "farthest"]
-"""At `random`, the point nearest the middle of each occupied `voxel`, or each time the one `farthest` from those kept."""
+"""`random`: random points. `voxel`: the most central point of each voxel. `farthest`: farthest-point sampling."""
 
 _BISECTIONS = 20
 
 
 @dataclass(frozen=True)
 class FilterReport:
-    """How many points each filter left."""
+    """Number of points after each filter."""
 
     recorded: int
     cropped: int
@@ -43,19 +43,20 @@ def clean_frame(
     downsampling: Downsampling = "random",
     rng: np.random.Generator,
 ) -> tuple[NDArray[np.int64], FilterReport]:
-    """Indices of the points of one frame to keep.
+    """Return the indices of the points of one frame that pass all filters.
 
     Args:
         points: [N, 3].
         crop: lowest and highest corner of a box.
         neighbours, deviations: a point is an outlier if its mean distance to this many neighbours exceeds the mean over
-            the cloud by this many standard deviations (the rule of PCL's StatisticalOutlierRemoval); 0 neighbours: off.
-        radius_m, radius_neighbours: a point is an outlier if fewer than this many others lie within the radius; None: off.
-        limit: keep at most this many points, none twice.
-        downsampling: how the points to keep are chosen.
+            the cloud by this many standard deviations (PCL's StatisticalOutlierRemoval); 0 neighbours: off.
+        radius_m, radius_neighbours: a point is an outlier if fewer than this many others are within the radius; None:
+            off.
+        limit: maximum number of points to keep.
+        downsampling: method to choose them.
 
     Raises:
-        EpisodeError: nothing is left; says after which filter.
+        EpisodeError: no point is left; names the filter.
     """
     keep = np.arange(len(points))
     if crop is not None:
@@ -86,7 +87,7 @@ def clean_frame(
 def thin(
     points: NDArray[np.float32], limit: int, downsampling: Downsampling, rng: np.random.Generator
 ) -> NDArray[np.int64]:
-    """Indices of at most `limit` of more points [N, 3], none twice; `voxel` may keep some fewer."""
+    """Return the indices of at most `limit` different points of [N, 3]; `voxel` may keep fewer."""
     if downsampling == "random":
         return rng.choice(len(points), limit, replace=False)
     if downsampling == "farthest":
@@ -96,7 +97,7 @@ def thin(
         return np.unique(cKDTree(points.astype(np.float64)).query(kept)[1])
     small, large = 0.0, float(np.ptp(points, axis=0).max()) * 1.01 + 1e-9  # one voxel holds all
     chosen = np.zeros(1, dtype=np.int64)
-    for _ in range(_BISECTIONS):  # for the smallest voxels that are not too many
+    for _ in range(_BISECTIONS):  # find the smallest voxel size that keeps at most `limit`
         size = 0.5 * (small + large)
         candidate = _one_per_voxel(points, size)
         if len(candidate) > limit:
@@ -107,11 +108,9 @@ def thin(
 
 
 def in_large_clusters(points: NDArray[np.floating[Any]], gap: float, least_part: float) -> NDArray[np.bool_]:
-    """[N] whether a point belongs to a cluster that holds at least `least_part` of the largest one's points.
-
-    Points of voxels of side `gap` that touch, also at corners, are of one cluster: clusters are at least `gap` apart.
-    Points have three coordinates, or time as a fourth one.
-    """
+    """Return which points belong to a cluster with at least `least_part` of the largest cluster's points, bool [N].
+    Points in adjacent voxels of side `gap`, also diagonally, belong to one cluster, so clusters are at least `gap`
+    apart. Points have three coordinates, or time as a fourth one."""
     if not len(points):
         return np.zeros(0, dtype=bool)
     cell = np.floor(points / gap).astype(np.int64)
@@ -126,17 +125,17 @@ def in_large_clusters(points: NDArray[np.floating[Any]], gap: float, least_part:
 
 
 def without_strays(episode: Episode, gap: float) -> Episode:
-    """The episode without clusters that are never connected with the cloth, such as pieces of robot and background.
+    """Remove clusters that are never connected with the cloth, such as parts of robot and background.
 
-    Clusters are those of `in_large_clusters`, in space and time: points of neighbouring frames are connected like points of
-    one frame. The largest cluster is the cloth. So a corner of the cloth that is connected with the rest in a later frame
-    only is kept, however few its points. A frame without any point of the largest cluster keeps all its points.
+    Clusters are those of `in_large_clusters` in space and time: points of neighbouring frames are connected like points
+    of one frame. The largest cluster is the cloth. So a corner of the cloth that is only connected with the rest in a
+    later frame is kept. A frame without points of the largest cluster keeps all its points.
 
     Args:
-        gap: least distance between clusters, in the episode's length unit.
+        gap: minimum distance between clusters, in the episode's length unit.
 
     Returns:
-        Its meta's `quality` has `strays`: the number of removed points in each frame.
+        An episode. `quality` in its meta has `strays`, the number of removed points in each frame.
     """
     frame = np.repeat(np.arange(episode.frame_count), np.diff(episode.offsets))
     kept = in_large_clusters(np.column_stack([episode.points, gap * (frame + 0.5)]), gap, 1.0)
@@ -148,7 +147,7 @@ def without_strays(episode: Episode, gap: float) -> Episode:
 
 
 def _one_per_voxel(points: NDArray[np.float32], size: float) -> NDArray[np.int64]:
-    """Index of the point nearest the middle of each occupied voxel."""
+    """Return the index of the point nearest the centre of each occupied voxel."""
     place = (points.astype(np.float64) - points.min(axis=0)) / size
     cell = np.floor(place).astype(np.int64)
     off = np.square(place - cell - 0.5).sum(axis=1)

@@ -1,9 +1,9 @@
-"""From a raw episode to clouds of the cloth alone: depth to points, robot and table taken out, views merged.
+"""Fusion of a raw episode into clouds of the cloth: unproject depth, remove robot and table, merge the views.
 
-Everything happens in the robot's base frame; the last step moves points and gripper into the scene's frame. The table
-is a plane fitted for each camera, so that a calibration that is millimetres off does not decide what lies on it. Points
-clearly above the plane stay; points within its noise stay where their colour is not the table's: cloth that lies flat
-is found by its colour.
+All steps use the robot's base frame; the last one transforms points and gripper to the scene's frame. The table plane
+is fitted separately for each camera, so that a calibration error of millimetres does not matter. Points clearly above
+the plane are kept. Points within the plane's noise are kept only if their colour differs from the table's. So cloth
+that lies flat is found by its colour.
 """
 
 from __future__ import annotations
@@ -35,9 +35,9 @@ Floats = NDArray[np.float64]
 Box = tuple[tuple[float, float, float], tuple[float, float, float]]
 
 _OVERLAP_M = 0.03
-"""Points of two views farther apart than this are not of the same place."""
+"""Points of two views overlap if they are closer than this [m]."""
 _STEEPEST = 0.94
-"""Cosine of the steepest table, 20 degrees."""
+"""Cosine of the largest tilt of a table, 20 degrees."""
 _TABLE_POINTS = 4000
 _TABLE_TRIALS = 300
 _TABLE_FRAMES = 5
@@ -45,73 +45,73 @@ _ON_TABLE_M = 0.005
 _REFINED_FRAMES = 10
 _REFINED_POINTS = 1000
 _DEEPEST_M = 0.03
-"""Points farther below the table are not of it."""
+"""Points farther below the plane than this [m] do not belong to the table."""
 _CLEAR_DEVIATIONS = 4.0
-"""In deviations of the table's heights: 3 in 100,000 of its points lie higher."""
+"""Clearance above the table, in standard deviations of its heights. Only 3 in 100,000 table points are higher."""
 _MOST_CLEARANCE_M = 0.02
-"""However much the heights deviate: something lower may lie beside the table."""
+"""Maximum clearance [m]. A larger spread may come from a lower object beside the table."""
 _LEAST_TABLE = 0.15
-"""A plane with a smaller part of the points is no table."""
+"""A plane is accepted as the table if it contains at least this fraction of the points."""
 
 
 @dataclass(frozen=True)
 class FusionSettings:
-    """How clouds are made of a raw episode."""
+    """Settings of the fusion of raw episodes."""
 
     workspace_m: Box = ((0.3, -0.5, -0.05), (1.0, 0.5, 0.7))
-    """Lowest and highest corner in the base frame; what lies outside is dropped."""
+    """Lowest and highest corner of a box in the base frame. Points outside are dropped."""
     imager_offsets_m: tuple[float, ...] = (0.015, 0.065)
     """See `masking.spoilt_pixels`."""
     depth_jump_m: float = 0.02
     clock_offset_s: float = 0.0
-    """How much later than the truth the joint log's times are."""
+    """Offset of the joint log's times: logged time minus true time."""
     table: bool = True
-    """Fit a plane and take it out."""
+    """Fit the table plane and remove its points."""
     clearance_m: float = 0.006
-    """Above the plane by this much a point stays, whatever its colour; so much below, it goes. If four standard deviations
-    of the table's heights are more, it is that, up to 2 cm."""
+    """Points higher above the plane than this are kept whatever their colour, and points deeper below it are removed.
+    If four standard deviations of the table's heights are more, that applies, up to 2 cm."""
     color_difference: float = 30.0
-    """Of 255, in any channel: a point within the clearance that differs more from the table's colour stays."""
+    """Points within the clearance are kept if any colour channel differs from the table's by more than this, of 255."""
     smoothing_px: int = 2
-    """Radius of the smoothing of depth (`smoothing`); 0: none."""
+    """Radius of the depth smoothing (`smoothing`); 0: none."""
     cluster_gap_m: float = 0.03
-    """Clusters of the merged cloud are this far apart; 0: no cluster is dropped."""
+    """Minimum distance between clusters of the merged cloud; 0: keep all clusters."""
     min_cluster_fraction: float = 0.05
-    """A cluster with a smaller part of the points of the largest one is no cloth: it is dropped."""
+    """Clusters with fewer points than this fraction of the largest cluster are removed."""
     subpixel_px: float = 0.08
-    """Deviation of the stereo disparity, in pixels of the camera's infrared imagers."""
+    """Standard deviation of the stereo disparity, in pixels of the camera's infrared imagers."""
     imager_focal_px: float = 425.0
-    """Focal length of these imagers, whatever the image's size: a D435's at 848 columns."""
+    """Focal length of the infrared imagers, whatever the image's size: a D435's at 848 columns."""
     baseline_m: float = 0.05
     refine: bool = True
-    """Find the other cameras' places relative to the first one's from the recording (`refinement`)."""
+    """Refine the other cameras' poses relative to the first one's from the recording (`refinement`)."""
     placement: ScenePlacement | None = None
-    """Where the scene lies; None: as episode.json says."""
+    """Pose of the scene in the base frame; None: as episode.json states."""
 
     @property
     def sigma_per_m(self) -> float:
-        """Deviation of inverse depth [1/m], the same at all distances: σ_z = z² σ_px / (f · baseline)."""
+        """Standard deviation of inverse depth [1/m], the same at all distances: σ_z = z² σ_px / (f · baseline)."""
         return self.subpixel_px / (self.imager_focal_px * self.baseline_m)
 
 
 @dataclass(frozen=True)
 class Seen:
-    """What is left of one image: points in the base frame."""
+    """Remaining points of one image, in the base frame."""
 
     image: int
-    """Which of the camera's."""
+    """Index of the image in its camera's sequence."""
     points: Floats
     pixels: NDArray[np.int64]
     colors: NDArray[np.uint8] | None
     depth_m: Floats
     spoilt: Spoilt
     measured: int
-    """Valid pixels in the workspace."""
+    """Number of valid pixels in the workspace."""
     lost: NDArray[np.bool_]
-    """[H, W] pixels in which cloth could not have been seen."""
+    """[H, W] pixels in which the camera could not have seen cloth."""
 
     def select(self, kept: NDArray[np.bool_]) -> Seen:
-        """The points [P] that are kept."""
+        """Return the points selected by a mask [P]."""
         return replace(
             self,
             points=self.points[kept],
@@ -123,19 +123,19 @@ class Seen:
 
 @dataclass(frozen=True)
 class Table:
-    """A plane and the colour of what it is of."""
+    """Plane of the table, and its colour."""
 
     normal: Floats
-    """[3] unit, upwards."""
+    """[3] unit normal, pointing upwards."""
     offset: float
     """normal · p = offset on the plane [m]."""
     color: Floats | None
     """[3] median, 0..255; None without colour images."""
     deviation: float
-    """One standard deviation of its points' heights [m]: noise that smoothing left, and how uneven the table is."""
+    """Standard deviation of the heights of its points [m], from remaining noise and unevenness."""
 
     def height(self, points: Floats) -> Floats:
-        """[...] of points [..., 3] above the plane [m]."""
+        """Return heights [...] of points [..., 3] above the plane [m]."""
         return points @ self.normal - self.offset
 
 
@@ -148,25 +148,26 @@ def fuse(
     tell: Callable[[int, str], None] = lambda done, text: None,
     watch: Callable[[int, Mapping[str, Seen]], None] = lambda frame, parts: None,
 ) -> Episode:
-    """The clouds of a raw episode in the scene's frame, with camera, pixel and deviation of each point.
+    """Return the clouds of a raw episode in the scene's frame, with camera, pixel and depth uncertainty of each point.
 
-    Frames are the first camera's; each other camera adds its image nearest in time, if one is within half a frame.
+    Frame times are those of the first camera. Each other camera contributes its image nearest in time, if it is within
+    half a frame interval.
 
     Args:
-        mask: of the robot; None leaves it in.
-        calibration: poses by serial; without it camera.json's own, or the file it names.
-        tell: called with (frames done, text).
-        watch: called with each frame and what is left of each camera's image.
+        mask: mask of the robot; None keeps its points.
+        calibration: poses by serial number. Default: those in camera.json, or in the file it names.
+        tell: progress callback with (frames done, text).
+        watch: callback with each frame and the remaining points of each camera's image.
 
     Returns:
-        An episode whose meta holds `viewpoints` (camera -> its place in the scene) and `quality`, figures for each frame:
-        `points_per_view` and `masked_fraction` by camera, `overlap_m` (median distance of the second view's points to the
-        first's where they overlap; None without any), and
-        `refinement`, what was found about the cameras' places, the arm's skin and the log's lag.
+        An episode. Its meta has `viewpoints` (camera -> position in the scene) and `quality`, with values per frame:
+            `points_per_view` and `masked_fraction` by camera, and `overlap_m` (median distance from the second view's
+            points to the first's where they overlap, or None). `refinement` in `quality` has the refined poses, the
+            arm's excess thickness and the log's clock offset.
 
     Raises:
-        EpisodeError: no robot log though a mask is asked for, a log that does not cover the video, a camera that is not
-            calibrated, an image without depth, or a frame of which nothing is left.
+        EpisodeError: a mask is given without a robot log, the log does not cover the video, a camera is not calibrated,
+            an image has no depth, or no point of a frame remains.
     """
     if mask is not None and raw.robot is None:
         raise EpisodeError("The recording has no joint log (robot.csv), so the robot cannot be masked: go without a mask.")
@@ -211,16 +212,16 @@ def fuse(
 
 
 class _Cameras:
-    """The cameras of a recording in their places, the arm before them, the table under it."""
+    """Cameras of a recording with their poses, robot masks and table planes."""
 
     def __init__(
         self, raw: RawEpisode, views: Mapping[str, View], mask: RobotMask | None, settings: FusionSettings
     ) -> None:
         self._raw, self._views, self._mask, self._settings = raw, views, mask, settings
         self.times = next(iter(raw.cameras.values())).times
-        """[T] of the frames: the first camera's."""
+        """[T] frame times, those of the first camera."""
         self._poses: dict[str, Floats] = {}
-        if mask is not None and raw.robot is not None:  # of all images of all cameras at once
+        if mask is not None and raw.robot is not None:  # for all images of a camera at once
             self._poses = {
                 name: mask.robot.forward_kinematics(
                     mask.robot.configuration(*joints_at(raw.robot, camera.times, clock_offset_s=settings.clock_offset_s))
@@ -236,7 +237,7 @@ class _Cameras:
                 self._tables[name] = fit_table(self._samples[name])
 
     def cloth(self, frame: int) -> dict[str, Seen]:
-        """What is left in each camera's image of a frame; cameras without an image near its time are absent."""
+        """Return the cloth points in each camera's image of a frame. Cameras without a near image are omitted."""
         parts = {
             name: _without_table(self._cloud(name, index), self._tables[name], self._settings)
             for name, index in self._images(frame).items()
@@ -244,7 +245,7 @@ class _Cameras:
         return _without_scraps(parts, self._settings)
 
     def sight(self) -> Sight:
-        """What a few frames show, for the refinement.
+        """Return the points of a few frames, for the refinement of the poses.
 
         Raises:
             EpisodeError: no frame has an image of every camera.
@@ -277,7 +278,7 @@ class _Cameras:
         return _few(points[np.abs(table.height(points)) < _ON_TABLE_M], _TABLE_POINTS)
 
     def _images(self, frame: int) -> dict[str, int]:
-        """Of each camera the image nearest in time, where one is within half a frame."""
+        """Return the index of each camera's nearest image, if it is within half a frame interval."""
         time, near = self.times[frame], {}
         for name, camera in self._raw.cameras.items():
             index = int(np.abs(camera.times - time).argmin())
@@ -291,9 +292,9 @@ class _Cameras:
 
 
 def fit_table(samples: list[tuple[Floats, NDArray[np.uint8] | None]]) -> Table | None:
-    """The largest level plane among points of several images, or None where none holds a fair part of them.
+    """Return the largest level plane in points of several images; None if it contains too few of them.
 
-    RANSAC with one set of trials tested at once, then least squares over what lies within 5 mm, twice.
+    RANSAC tests one set of trials at once. Two least-squares fits to the points within 5 mm follow.
 
     Args:
         samples: (points [N, 3] [m], colours [N, 3] or None) of each image.
@@ -322,7 +323,7 @@ def fit_table(samples: list[tuple[Floats, NDArray[np.uint8] | None]]) -> Table |
         offset = float(centre @ up)
     up, offset = (up, offset) if up[2] > 0 else (-up, -offset)
     heights = points @ up - offset
-    under = heights[(heights < 0) & (heights > -_DEEPEST_M)]  # where no cloth is
+    under = heights[(heights < 0) & (heights > -_DEEPEST_M)]  # only table points lie below the plane
     spread = deviation(under) if len(under) else 0.0
     colors = [color[np.abs(sample @ up - offset) < _ON_TABLE_M] for sample, color in samples if color is not None]
     color = np.median(np.concatenate(colors), axis=0) if colors and sum(map(len, colors)) else None
@@ -368,17 +369,17 @@ def _cloud(
 
 
 def _spread(count: int, wanted: int) -> list[int]:
-    """At most so many indices, from the first to the last."""
+    """Return at most `wanted` evenly spaced indices, including the first and the last."""
     return [int(index) for index in np.unique(np.linspace(0, count - 1, wanted).astype(int))] if count else []
 
 
 def _few(points: Floats, wanted: int) -> Floats:
-    """At most about so many of points [N, 3]."""
+    """Return about `wanted` of the points [N, 3]."""
     return points[:: max(1, len(points) // wanted)]
 
 
 def _sample(cloud: Seen) -> tuple[Floats, NDArray[np.uint8] | None]:
-    """Every few points: a plane needs no more."""
+    """Subsample a cloud, since a plane fit needs few points."""
     step = max(1, len(cloud.points) // (5 * _TABLE_POINTS))
     return cloud.points[::step], None if cloud.colors is None else cloud.colors[::step]
 
@@ -396,7 +397,7 @@ def _without_table(cloud: Seen, table: Table | None, settings: FusionSettings) -
 
 
 def _without_scraps(parts: dict[str, Seen], settings: FusionSettings) -> dict[str, Seen]:
-    """Views without small clusters of their union: bits of table and robot that slipped through."""
+    """Remove small clusters of the merged views, which are remains of table and robot."""
     if settings.cluster_gap_m == 0:
         return parts
     kept = in_large_clusters(
@@ -407,7 +408,7 @@ def _without_scraps(parts: dict[str, Seen], settings: FusionSettings) -> dict[st
 
 
 class _Quality:
-    """Figures of each frame."""
+    """Quality figures of each frame."""
 
     def __init__(self, names: list[str]) -> None:
         self._names = names
@@ -473,21 +474,21 @@ def _episode(
 
 
 def _lost(names: Sequence[str], views: Mapping[str, View], frames: Sequence[Mapping[str, Seen]]) -> NDArray[np.uint8]:
-    """[T, C, bytes] as of an episode; of a frame without an image, all."""
+    """Return the packed invalid-pixel masks [T, C, bytes] of an episode. All pixels of a missing image are invalid."""
     most = max(view.intrinsics.width * view.intrinsics.height for view in views.values())
     lost = np.ones((len(frames), len(names), most), dtype=bool)
     for camera, name in enumerate(names):
         column, row = _ideal_pixels(views[name].intrinsics)
         for index, frame in enumerate(frames):  # images came one after the other
             if name in frame:
-                seen = np.pad(frame[name].lost, 1, constant_values=True)  # what lies beyond the image is lost
+                seen = np.pad(frame[name].lost, 1, constant_values=True)  # pixels outside the image are invalid
                 lost[index, camera, : row.size] = seen[row + 1, column + 1]
     return np.packbits(lost, axis=-1)
 
 
 def _ideal_pixels(intrinsics: Intrinsics) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """(column, row) [H W] of the pixels that look where those of a camera without distortion would; -1 or the image's
-    size beyond its rims."""
+    """Return (column, row) [H W] of the pixels with the same rays as the pixels of an undistorted camera; -1 or the
+    image's size outside the image."""
     row, column = np.mgrid[: intrinsics.height, : intrinsics.width].reshape(2, -1)
     straight = rays(np.column_stack([column, row]), replace(intrinsics, distortion="none", coefficients=()))
     found = project(straight, intrinsics).round()
@@ -496,7 +497,7 @@ def _ideal_pixels(intrinsics: Intrinsics) -> tuple[NDArray[np.int64], NDArray[np
 
 
 def _pinhole(view: View, placement: ScenePlacement) -> Pinhole:
-    """A camera in the scene's frame, its distortion left out."""
+    """Return an undistorted camera model in the scene's frame."""
     told = view.intrinsics
     eye = placement.to_scene(view.T_world_camera[:3, 3])
     axes = view.T_world_camera[:3, :3].T @ placement.rotation.T
@@ -507,8 +508,8 @@ def _pinhole(view: View, placement: ScenePlacement) -> Pinhole:
 def _tool(
     raw: RawEpisode, times: Floats, mask: RobotMask | None, settings: FusionSettings
 ) -> tuple[Floats | None, str | None]:
-    """[T, 3] of the tool in the base frame, as the arm reported it, else by its joints, None where neither is known; and
-    why that may not be where its fingertips are."""
+    """Return tool positions [T, 3] in the base frame, and a warning if they may differ from the fingertips. Positions
+    are those that the arm reported, else those of the joints, else None."""
     log = raw.robot
     if log is None or not len(log.times):
         return None, None
@@ -523,11 +524,11 @@ def _tool(
 
 
 def camera_pose(info: CameraInfo, folder: Path, calibration: Calibration | None) -> Floats:
-    """T_world_camera [4, 4] of a camera of the raw episode in a folder, by default as its camera.json says.
+    """Return T_world_camera [4, 4] of a camera of a raw episode; by default that in its camera.json.
 
     Raises:
-        EpisodeError: no calibration was given, and camera.json has neither a pose nor a calibration file.
-        CalibrationError: an unreadable calibration, or one without this camera.
+        EpisodeError: there is no calibration, and camera.json has neither a pose nor a calibration file.
+        CalibrationError: the calibration is unreadable or lacks this camera.
     """
     if calibration is None and info.calibration is not None:
         calibration = read_calibration(folder / info.calibration)

@@ -1,14 +1,13 @@
-"""Which pixels of a depth image show the robot, or are spoilt by it.
+"""Masks of the pixels of a depth image that show the robot or are corrupted by it.
 
-The links' surfaces, moved outwards by a margin that covers calibration, the description's errors and the joint log's
-lag, are cast into the camera. What is measured at or behind that surface is robot. Stereo needs both of its eyes: a
-point that the robot hides from the other one lies in its occlusion shadow, where a camera guesses. At borders it may
-average foreground and background: such flying pixels are found by their few neighbours in depth, whatever made the
-border.
+The links' surfaces are inflated by a margin, which covers errors of calibration, robot model and clock, and rendered
+into the camera. Measurements at or behind that surface are robot. Stereo needs both imagers: a point that the robot
+occludes from one of them is in its occlusion shadow, where depth is unreliable. At borders, stereo may average
+foreground and background. Such flying pixels are detected by their few neighbours of similar depth.
 
-Each link has a ray-casting structure of its own, built once in the link's frame; a frame moves the rays, not the
-triangles, and casts only the pixels whose rays can meet the link. (Rebuilding one structure of all links costs four
-times as much a frame.)
+Each link has its own ray-casting structure, built once in the link's frame. For each frame the rays are transformed
+instead of the triangles, and only pixels whose rays can hit the link are cast. (Rebuilding one structure of all links
+takes four times as long per frame.)
 """
 
 from __future__ import annotations
@@ -33,17 +32,17 @@ Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 _LONGEST_MITRE = 2.0
-"""A vertex moves by at most this many margins; a box's corner needs 1.73."""
+"""Maximum displacement of a vertex, in margins; a box's corner needs 1.73."""
 _NEAREST_M = 0.01
 _OUTSIDE_S = 0.1
-"""Joints are held this long beyond the ends of their log."""
+"""The joint log may end this much [s] before the images do; the last joints are then held."""
 _FEWEST_SUPPORTING = 3
 _NOISE_DEVIATIONS = 2.0
 
 
 @dataclass(frozen=True)
 class View:
-    """A camera in its place."""
+    """A camera's intrinsics and pose."""
 
     intrinsics: Intrinsics
     T_world_camera: Floats
@@ -57,16 +56,16 @@ class View:
 
     @cached_property
     def _columns(self) -> Floats:
-        """[2, W] least and greatest x of the rays of each column."""
+        """[2, W] smallest and largest x of the rays of each column."""
         return np.stack([self.directions[..., 0].min(axis=0), self.directions[..., 0].max(axis=0)])
 
     @cached_property
     def _rows(self) -> Floats:
-        """[2, H] least and greatest y of the rays of each row."""
+        """[2, H] smallest and largest y of the rays of each row."""
         return np.stack([self.directions[..., 1].min(axis=1), self.directions[..., 1].max(axis=1)])
 
     def window(self, low: Floats, high: Floats) -> tuple[slice, slice]:
-        """Rows and columns of all rays with (x, y) between `low` [2] and `high` [2]."""
+        """Return the rows and columns of all rays with (x, y) between `low` [2] and `high` [2]."""
         rows = np.flatnonzero((self._rows[1] >= low[1]) & (self._rows[0] <= high[1]))
         columns = np.flatnonzero((self._columns[1] >= low[0]) & (self._columns[0] <= high[0]))
         if not len(rows) or not len(columns):
@@ -75,18 +74,18 @@ class View:
 
 
 class RobotMask:
-    """A robot's inflated surface, ready to be cast into cameras.
+    """A robot's inflated surface, prepared for ray casting.
 
     Args:
-        robot_margin_m: margin around every link, or by link; others have none [m].
+        robot_margin_m: margin [m] around every link, or by link; links without an entry have none.
     """
 
     def __init__(self, robot: Robot, *, robot_margin_m: float | Mapping[str, float] = 0.01) -> None:
         self.robot = robot
         self._indices: list[int] = []
-        """Places among the robot's links of those that have a surface."""
+        """Indices of the links that have a surface."""
         self._scenes: list[Any] = []
-        """Their ray-casting scenes."""
+        """Ray-casting scenes of these links."""
         open3d = import_open3d()
         boxes: list[Floats] = []
         for name, mesh in robot.description.meshes.items():
@@ -99,10 +98,10 @@ class RobotMask:
             self._scenes.append(scene)
             boxes.append(corners)
         self._corners = np.array(boxes).reshape(-1, 8, 3)
-        """Of their boxes."""
+        """Corners of the links' bounding boxes."""
 
     def surface(self, view: View, poses: Floats) -> NDArray[np.float32]:
-        """z-depth [H, W] [m] of the inflated robot, infinite beside it.
+        """Return the z-depth [H, W] [m] of the inflated robot; infinite beside it.
 
         Args:
             poses: [L, 4, 4] T_world_link.
@@ -110,7 +109,7 @@ class RobotMask:
         return self.first_hits(view, poses)[0]
 
     def first_hits(self, view: View, poses: Floats) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
-        """(z-depth [H, W] [m] of the inflated robot, which of its links is hit [H, W]); infinite and -1 beside it."""
+        """Return z-depth [H, W] [m] of the inflated robot and index of the link [H, W]; infinite and -1 beside it."""
         depth = np.full(view.directions.shape[:2], np.inf, dtype=np.float32)
         link = np.full(depth.shape, -1)
         for index, scene, T_link_camera, low, high in self._placed(view.T_world_camera, poses, np.zeros(3)):
@@ -125,15 +124,12 @@ class RobotMask:
     def hides(
         self, points: Floats, T_world_camera: Floats, poses: Floats, *, eye: Sequence[float] = (0.0, 0.0, 0.0)
     ) -> Mask:
-        """Whether the inflated robot stands between an eye and points, or holds them.
+        """Return whether the inflated robot occludes or contains points, [N].
 
         Args:
             points: [N, 3] in the camera's frame [m].
             poses: [L, 4, 4] T_world_link.
-            eye: [3] in the camera's frame [m].
-
-        Returns:
-            [N].
+            eye: [3] viewpoint in the camera's frame [m].
         """
         from_eye = points - eye
         x, y = np.ascontiguousarray((from_eye[:, :2] / np.maximum(from_eye[:, 2:], _NEAREST_M)).T)
@@ -147,28 +143,28 @@ class RobotMask:
     def _placed(
         self, T_world_camera: Floats, poses: Floats, eye: Floats
     ) -> Iterator[tuple[int, Any, Floats, Floats, Floats]]:
-        """(link, scene, T_link_camera, least and greatest (x, y) of rays from the eye that can meet it) of each link."""
+        """Yield (link, scene, T_link_camera, lowest and highest (x, y) of rays that can hit it) for each link."""
         T_link_camera = inverse(poses[self._indices]) @ T_world_camera
         seen = transform(inverse(T_link_camera), self._corners) - eye
         behind = seen[..., 2] < _NEAREST_M
         plane = seen[..., :2] / np.maximum(seen[..., 2:], _NEAREST_M)
         low, high = plane.min(axis=1), plane.max(axis=1)
-        anywhere = behind.any(axis=1)  # what reaches behind the camera may have its picture anywhere
+        anywhere = behind.any(axis=1)  # its projection is unbounded if it reaches behind the camera
         low[anywhere], high[anywhere] = -np.inf, np.inf
-        for row in np.flatnonzero(~behind.all(axis=1)):  # links have trees of their own
+        for row in np.flatnonzero(~behind.all(axis=1)):  # each link has its own search tree
             yield self._indices[row], self._scenes[row], T_link_camera[row], low[row], high[row]
 
 
 @dataclass(frozen=True)
 class Spoilt:
-    """What masking found in one depth image; each [H, W], and no pixel without depth is in any."""
+    """Masks [H, W] of one depth image. Pixels without depth are in none of them."""
 
     robot: Mask
     """At or behind the robot's inflated surface."""
     shadow: Mask
-    """Hidden from one of the camera's eyes by the robot."""
+    """Occluded by the robot from one of the camera's imagers."""
     flying: Mask
-    """Between foreground and background."""
+    """Flying pixels, between foreground and background."""
 
     @property
     def any(self) -> Mask:
@@ -186,17 +182,17 @@ def spoilt_pixels(
     depth_jump_m: float = 0.01,
     sigma_per_m: float = 0.0,
 ) -> Spoilt:
-    """Pixels that show no cloth because of the robot, or of a border.
+    """Return the pixels that cannot show cloth because of the robot or a depth border.
 
     Args:
         depth_m: [H, W] z-depth [m]; 0 is no measurement.
         mask, poses: the robot and its [L, 4, 4] T_world_link; None without a robot.
-        within: [H, W] pixels that matter, such as those in the workspace; the others are in no set. None: all.
-        imager_offsets_m: places of the stereo pair's other imagers along the image's x [m]; a D435's second one is at 0.05
-            of its depth image.
-        depth_jump_m: see `flying_pixels`; 0 leaves them.
-        sigma_per_m: standard deviation of the inverse depth [1/m]. What is measured before the robot by no more than noise
-            explains is robot.
+        within: [H, W] pixels to classify, such as those in the workspace. None: all.
+        imager_offsets_m: positions of the other stereo imagers along the image's x [m]. A D435's second one is at 0.05
+            from its depth image.
+        depth_jump_m: see `flying_pixels`; 0 keeps them.
+        sigma_per_m: standard deviation of the inverse depth [1/m]. Measurements in front of the robot within noise are
+            robot.
     """
     valid = depth_m > 0 if within is None else (depth_m > 0) & within
     robot, shadow = np.zeros_like(valid), np.zeros_like(valid)
@@ -213,7 +209,7 @@ def spoilt_pixels(
 
 
 def flying_pixels(depth_m: NDArray[np.floating[Any]], step_m: float) -> Mask:
-    """Measured pixels [H, W] of which fewer than 3 of the 8 neighbours lie within `step_m` in depth."""
+    """Return measured pixels [H, W] with fewer than 3 of 8 neighbours within `step_m` in depth."""
     padded = np.pad(depth_m, 1)
     height, width = depth_m.shape
     supporting = np.zeros(depth_m.shape, dtype=np.uint8)
@@ -224,10 +220,11 @@ def flying_pixels(depth_m: NDArray[np.floating[Any]], step_m: float) -> Mask:
 
 
 def inflate(mesh: LinkMesh, margin_m: float) -> LinkMesh:
-    """The surface with every face moved outwards by `margin_m`, together with the surface itself; inwards, it alone.
+    """Return the surface with every face moved outwards by `margin_m`, joined with the original; a negative margin
+    gives only the moved surface.
 
-    Vertices move along the mean normal of their faces, farther at edges so that the faces move by the whole margin. The
-    original is kept because a scanned mesh may have faces that are turned inside out.
+    Vertices move along the mean normal of their faces, farther at edges, so that the faces move by the whole margin.
+    The original is kept because a scanned mesh may have faces with wrong orientation.
     """
     if margin_m == 0:
         return mesh
@@ -236,7 +233,7 @@ def inflate(mesh: LinkMesh, margin_m: float) -> LinkMesh:
 
 
 def offset(mesh: LinkMesh, margin_m: float) -> LinkMesh:
-    """The surface with every face moved outwards by `margin_m` (inwards where negative), equal vertices made one."""
+    """Return the surface moved outwards by `margin_m` (inwards if negative), with equal vertices merged."""
     corner, same = np.unique(np.round(mesh.vertices, 7), axis=0, return_inverse=True)  # STL repeats its vertices
     faces = same.reshape(-1)[mesh.faces]
     normal = np.cross(corner[faces[:, 1]] - corner[faces[:, 0]], corner[faces[:, 2]] - corner[faces[:, 0]])
@@ -255,11 +252,11 @@ def offset(mesh: LinkMesh, margin_m: float) -> LinkMesh:
 
 
 def joints_at(log: RobotLog, times: Floats, *, clock_offset_s: float = 0.0) -> tuple[Floats, Floats]:
-    """The arm when images were taken, between rows linearly: joints [T, J] [rad], gripper [T] 0..1 or NaN.
+    """Interpolate the joint log at image times: joints [T, J] [rad], gripper [T] from 0 to 1 or NaN.
 
     Args:
-        times: [T] of the images, on the log's clock [s].
-        clock_offset_s: how much later than the truth the log's times are.
+        times: [T] image times on the true clock [s].
+        clock_offset_s: logged time minus true time.
 
     Raises:
         EpisodeError: the log is empty or does not cover the images.
@@ -283,7 +280,8 @@ def joints_at(log: RobotLog, times: Floats, *, clock_offset_s: float = 0.0) -> t
 
 
 def _cast(scene: Any, T_link_camera: Floats, eye: Floats, directions: Floats) -> NDArray[np.float32]:
-    """[...] of the first hit in lengths of `directions` [..., 3], which start at `eye` in the camera's frame."""
+    """Return the distance [...] to the first hit in lengths of `directions` [..., 3], from `eye` in the camera's
+    frame."""
     bundle = np.empty((*directions.shape[:-1], 6), dtype=np.float32)
     bundle[..., :3] = T_link_camera[:3, :3] @ eye + T_link_camera[:3, 3]
     bundle[..., 3:] = rotate(T_link_camera, directions)

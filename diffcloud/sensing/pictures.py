@@ -1,4 +1,4 @@
-"""Pictures that let a person judge a calibration, a mask, or a merged cloud at a glance."""
+"""Pictures for a quick visual check of a calibration, a mask or a merged cloud."""
 
 from __future__ import annotations
 
@@ -28,10 +28,10 @@ def reprojection_picture(
     board: CharucoBoard,
     found: HandEyeResult,
 ) -> NDArray[np.uint8]:
-    """Detected corners as green rings, reprojected ones as red crosses: a row of three views for each camera.
+    """Draw detected corners as green circles and reprojected ones as red crosses, in a row of three views per camera.
 
     Returns:
-        uint8 [H, W, 3] red, green, blue. Narrower rows are filled with black.
+        uint8 [H, W, 3] red, green, blue. Narrower rows are padded with black.
     """
     import cv2
 
@@ -55,12 +55,12 @@ def reprojection_picture(
 
 
 def mask_picture(cameras: Mapping[str, RawCamera], parts: Mapping[str, Seen]) -> NDArray[np.uint8]:
-    """Each camera's image side by side: red what was masked, green what was kept as cloth.
+    """Show each camera's image side by side, with masked pixels in red and kept cloth pixels in green.
 
-    Without colour images depth is shown in grey.
+    Depth in grey replaces missing colour images.
 
     Returns:
-        uint8 [H, W, 3] red, green, blue. Lower images are filled with black.
+        uint8 [H, W, 3] red, green, blue. Lower images are padded with black.
     """
     tiles = []
     for name, part in parts.items():
@@ -79,13 +79,13 @@ def mask_picture(cameras: Mapping[str, RawCamera], parts: Mapping[str, Seen]) ->
 
 
 def cloud_picture(episode: Episode, frame: int, *, size: int = 240) -> NDArray[np.uint8]:
-    """A merged cloud from above, from the front (along y) and from the side (along x), coloured by camera.
+    """Draw a merged cloud from above, from the front (along y) and from the side (along x), coloured by camera.
 
     Args:
-        size: of each of the three squares [px].
+        size: size of each of the three squares [px].
 
     Returns:
-        uint8 [size, 3 size, 3] red, green, blue on white; x to the right, or z upwards.
+        uint8 [size, 3 size, 3] red, green, blue on white, with x to the right or z upwards.
     """
     points = episode.frame(frame).astype(np.float64)
     camera = (

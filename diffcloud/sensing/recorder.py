@@ -1,13 +1,14 @@
-"""Synthetic raw episodes: an arm moves a simulated cloth over a table before depth cameras.
+"""Synthetic raw episodes: an arm moves a simulated cloth over a table in front of depth cameras.
 
-What is written is a raw episode like any other. Beside it, in the folder `truth`, lies what no recording knows: which pixel
-shows what, where the cloth was, where the cameras stood. Nothing that reads raw episodes looks there.
+The output is a normal raw episode. The additional folder `truth` has the ground truth: pixel labels, cloth positions
+and camera poses. No code that reads raw episodes uses it.
 
     truth/cloth.npz                   nodes [T, V, 3] [m] in the world, faces [F, 3], times [T] [s]
-    truth/cameras.json                T_world_camera of each camera, and where the scene was
+    truth/cameras.json                T_world_camera of each camera, and the true pose of the scene
     truth/<cam>/000000.png            16-bit [H, W] labels: NOTHING, TABLE, CLOTH, ROBOT
 
-What is rendered is not what a mask is made of (`arm_body`), and the joint log is late: the mask has something to prove.
+The rendered arm differs from the model that the mask uses (`arm_body`), and the joint log has a clock offset. This
+makes the test of the mask realistic.
 """
 
 from __future__ import annotations
@@ -40,96 +41,95 @@ Floats = NDArray[np.float64]
 
 NOTHING, TABLE, CLOTH, ROBOT = range(4)
 STARTED_AT = "2000-01-01T00:00:00.000+00:00"
-"""Of every synthetic episode, so that the same seed gives the same bytes."""
+"""Start time of every synthetic episode, so that the same seed gives the same bytes."""
 
 _DOWN = np.diag([1.0, -1.0, -1.0])
-"""The gripper points down, its fingers on both sides of the cloth along x."""
+"""Orientation of a gripper that points down, with the fingers on both sides of the cloth along x."""
 _LEANS_DEG = (0.0, 10.0, 20.0, 30.0)
-"""Angles by which it points outwards; the first at which the arm can hold the cloth during the whole motion is taken."""
+"""Outward tilt angles of the gripper. The first one at which the arm reaches the whole motion is used."""
 _GRASP_M = 0.071
-"""From the tool's frame to where the fingers' ends hold the cloth, along the tool's z."""
+"""Distance along the tool's z from the tool frame to the fingertips."""
 _GRIPPER_CLOSED = 1.0
 _COLORS = np.array([[60, 60, 60], [126, 114, 100], [0, 0, 0], [205, 205, 208]], dtype=np.float64)
-"""Of NOTHING (the floor), TABLE, CLOTH (given) and ROBOT; red, green, blue."""
+"""RGB colours of NOTHING (the floor), TABLE, CLOTH (replaced by a setting) and ROBOT."""
 _CABLE_COLOR = np.array([30.0, 30.0, 30.0])
 _COLOR_NOISE = 4.0
 _LIGHT = np.array([0.3, -0.4, 0.866])
 _SAME = 2e-3
-"""A hit this part of the way before a point is the point itself."""
+"""Relative tolerance of an occlusion test: a hit this close before a point is the point itself."""
 _BEFORE_S = 0.5
-"""The joint log starts this long before the first image and ends so long after the last."""
+"""The joint log starts this long before the first image and ends this long after the last [s]."""
 
 
 _IN_REACH = ScenePlacement((0.5, 0.04, 0.0), float(np.pi / 2))
-"""The cloth before the arm; turned as in the published experiments."""
+"""Pose of the cloth in front of the arm, rotated as in the published experiments."""
 
 
 @dataclass(frozen=True)
 class RecorderSettings:
-    """What the synthetic set-up is like."""
+    """Settings of the synthetic set-up."""
 
     placement: ScenePlacement = _IN_REACH
     joint_rate_hz: float = 40.0
     clock_offset_s: float = 0.02
-    """The joint log's times are late by this much."""
+    """Offset of the joint log's times: logged time minus true time."""
     largest_growth_m: float = 0.003
-    """The rendered arm is larger than its description by at most this."""
+    """Maximum excess size of the rendered arm relative to its model."""
     with_cable: bool = True
     extrinsic_error: tuple[float, float] = (0.0, 0.0)
-    """(millimetres, degrees) by which the stated place of each camera but the first is off, in a direction drawn for the
-    episode."""
+    """(mm, degrees) error of the stated pose of each camera except the first, in a random direction per episode."""
     rig_error: tuple[float, float] = (0.0, 0.0)
-    """The same for all cameras together, which then still agree with one another, but not with the arm."""
+    """(mm, degrees) common pose error of all cameras. They still agree with each other, but not with the arm."""
     placement_error: tuple[float, float] = (0.0, 0.0)
-    """(millimetres, degrees about the vertical) by which cloth and gripper are not where the recording says."""
+    """(mm, degrees about the vertical) difference between the true and the stated pose of cloth and gripper."""
     table_size_m: tuple[float, float] = (1.1, 1.3)
-    """Along x and y of the base frame, its middle under the scene's origin."""
+    """Size along x and y of the base frame, centred below the scene's origin."""
 
 
 @dataclass(frozen=True)
 class ClothMotion:
-    """What there is to see, in the scene's frame."""
+    """Simulated motion to render, in the scene's frame."""
 
     nodes: Floats
-    """[T, V, 3] at each frame."""
+    """[T, V, 3] nodes at each frame."""
     faces: NDArray[np.int64]
-    """[F, 3]."""
+    """[F, 3] faces of the cloth."""
     times: Floats
-    """[T] [s]."""
+    """[T] times of the frames [s]."""
     grasped: Sequence[int]
-    """Nodes whose mean the gripper holds."""
+    """Nodes whose mean position the gripper follows."""
     table_height: float = 0.0
 
 
 @dataclass(frozen=True)
 class Truth:
-    """What no recording knows."""
+    """Ground truth of a synthetic episode."""
 
     nodes: Floats
-    """[T, V, 3] of the cloth in the world [m]."""
+    """[T, V, 3] cloth nodes in the world [m]."""
     faces: NDArray[np.int64]
     T_world_camera: Mapping[str, Floats]
     placement: ScenePlacement
-    """Where the scene truly was."""
+    """True pose of the scene."""
     folder: Path
 
     def labels(self, camera: str, index: int) -> NDArray[np.uint16]:
-        """[H, W] NOTHING, TABLE, CLOTH or ROBOT."""
+        """Return labels [H, W]: NOTHING, TABLE, CLOTH or ROBOT."""
         return read_depth(self.folder / camera / f"{index:06d}.png")
 
     def visible_cloth(self, camera: str, intrinsics: Intrinsics, index: int) -> tuple[Floats, NDArray[np.int64]]:
-        """World points [P, 3] [m] and pixels [P, 2] of the cloth that a faultless camera sees."""
+        """Return the world points [P, 3] [m] and pixels [P, 2] of the cloth in an ideal camera image."""
         view = View(intrinsics, self.T_world_camera[camera])
         seen = self.labels(camera, index) == CLOTH
         row, column = np.nonzero(seen)
         depth, _, _ = _cast(caster([SurfaceMesh(self.nodes[index], self.faces)]), view, np.zeros(3), view.directions[seen])
-        hit = np.isfinite(depth)  # single precision may pass the rim on its other side
+        hit = np.isfinite(depth)  # a ray in single precision may miss the rim
         points = transform(view.T_world_camera, view.directions[seen][hit] * depth[hit, None])
         return points, np.column_stack([column, row])[hit]
 
 
 def read_truth(folder: Path) -> Truth:
-    """The truth beside a synthetic raw episode.
+    """Read the ground truth of a synthetic raw episode.
 
     Raises:
         EpisodeError: the episode is not synthetic, or a file is damaged.
@@ -161,18 +161,18 @@ def record(
     meta: Mapping[str, Any],
     tell: Callable[[int, str], None] = lambda done, text: None,
 ) -> None:
-    """Write a synthetic raw episode and its truth.
+    """Write a synthetic raw episode and its ground truth.
 
     Args:
-        folder: must not exist yet.
+        folder: output folder, which must not exist yet.
         cloth_color: red, green, blue in full light.
-        seed: of the noise, the arm's shape, and the extrinsic error.
-        meta: scenario, fabric and such, for episode.json.
-        tell: called with (frames done, text).
+        seed: seed of the noise, the arm's shape and the extrinsic error.
+        meta: labels for episode.json, such as scenario and fabric.
+        tell: progress callback with (frames done, text).
 
     Raises:
         EpisodeError: the folder exists.
-        RobotError: the cloth's path is out of the arm's reach, however the gripper leans.
+        RobotError: the cloth's path is out of the arm's reach at every tilt of the gripper.
     """
     settings = settings or RecorderSettings()
     rng, others = np.random.default_rng(seed), np.random.default_rng([seed, 1])
@@ -221,13 +221,13 @@ def record(
 
 
 def _holding(robot: Robot, held: Floats) -> Floats:
-    """[T, J] joint angles [rad] of an arm whose gripper holds the cloth, pointing down if it can.
+    """Return joint angles [T, J] [rad] with which the gripper holds the cloth, pointing down if possible.
 
     Args:
-        held: [T, 3] where it holds the cloth, in the world [m].
+        held: [T, 3] grasp points in the world [m].
 
     Raises:
-        RobotError: out of reach.
+        RobotError: the path is out of reach.
     """
     x, y, _ = held.mean(axis=0)
     sideways = np.array([y, -x, 0.0]) / np.hypot(x, y)
@@ -243,7 +243,7 @@ def _holding(robot: Robot, held: Floats) -> Floats:
 
 
 class _Scene:
-    """Cloth, arm and table, ready to be cast into cameras."""
+    """Ray-casting scene of cloth, arm and table."""
 
     def __init__(
         self,
@@ -267,10 +267,10 @@ class _Scene:
         loose = [SurfaceMesh(nodes, self._faces)]
         if self._settings.with_cable:
             loose.append(cable(self._robot, poses))
-        self._loose = caster(loose)  # rebuilt for each frame; the links' and the table's structures are not
+        self._loose = caster(loose)  # rebuilt for each frame, unlike the structures of links and table
 
     def render(self, view: View, rng: np.random.Generator) -> tuple[Floats, NDArray[np.uint16], NDArray[np.uint8]]:
-        """(z-depth [H, W] [m], labels [H, W], colour [H, W, 3])."""
+        """Return (z-depth [H, W] [m], labels [H, W], colour [H, W, 3])."""
         table, _, _ = _cast(self._table, view, np.zeros(3), view.directions)
         loose, which, normal = _cast(self._loose, view, np.zeros(3), view.directions)
         arm = self._arm.surface(view, self._poses).astype(np.float64)
@@ -291,9 +291,9 @@ class _Scene:
         return depth, labels, np.clip(np.rint(noisy), 0, 255).astype(np.uint8)
 
     def hidden(self, camera: DepthCamera, depth_m: Floats, labels: NDArray[np.uint16]) -> NDArray[np.bool_]:
-        """[H, W] pixels whose point one of the camera's imagers does not see."""
+        """Return pixels [H, W] whose point is occluded from one of the camera's imagers."""
         view = camera.view
-        seen = (labels == CLOTH) | (labels == TABLE)  # what the arm hides of itself is left: it is robot either way
+        seen = (labels == CLOTH) | (labels == TABLE)  # occluded robot pixels would still be robot
         points = view.directions[seen] * depth_m[seen][:, None]
         lost = np.zeros(len(points), dtype=bool)
         for x in camera.imager_offsets_m:
@@ -308,7 +308,7 @@ class _Scene:
 
 
 def caster(meshes: Sequence[SurfaceMesh]) -> Any:
-    """A ray-casting structure of meshes in the world."""
+    """Return a ray-casting structure of meshes in the world."""
     open3d = import_open3d()
     scene = open3d.t.geometry.RaycastingScene(nthreads=1)
     for mesh in meshes:
@@ -317,10 +317,10 @@ def caster(meshes: Sequence[SurfaceMesh]) -> Any:
 
 
 def _cast(scene: Any, view: View, eye: Floats, directions: Floats) -> tuple[Floats, NDArray[np.uint32], Floats]:
-    """(first hit in lengths of `directions` [..., 3], which mesh, its normal in the world).
+    """Return (first hit in lengths of `directions` [..., 3], index of the mesh, its normal in the world).
 
     Args:
-        eye: [3] where the rays start, in the camera's frame, as the directions are.
+        eye: [3] origin of the rays, in the camera's frame like the directions.
     """
     pose = view.T_world_camera
     bundle = np.empty((*directions.shape[:-1], 6), dtype=np.float32)
@@ -338,7 +338,7 @@ def _table(motion: ClothMotion, settings: RecorderSettings) -> SurfaceMesh:
 
 
 def _motion(millimetres: float, degrees: float, nodes: Floats, rng: np.random.Generator) -> Floats:
-    """[4, 4] that turns about the scene's middle and moves, by these amounts in directions drawn at random."""
+    """Return a random transform [4, 4] with a rotation about the scene's centre and a shift of these sizes."""
     turn_axis, direction = rng.normal(size=(2, 3))
     middle, found = nodes.reshape(-1, 3).mean(axis=0), np.eye(4)
     turn = Rotation.from_rotvec(np.deg2rad(degrees) * turn_axis / np.linalg.norm(turn_axis)).as_matrix()
@@ -348,12 +348,12 @@ def _motion(millimetres: float, degrees: float, nodes: Floats, rng: np.random.Ge
 
 
 def _misplaced(settings: RecorderSettings, nodes: Floats, rng: np.random.Generator) -> ScenePlacement:
-    """The stated placement, turned about the cloth's middle and shifted on the table, in directions drawn at random."""
+    """Return the stated placement, rotated about the cloth's centre and shifted on the table, in random directions."""
     stated, (millimetres, degrees) = settings.placement, settings.placement_error
     way, sign = (
         rng.uniform(0.5 * np.pi, 1.5 * np.pi),
         rng.choice([-1.0, 1.0]),
-    )  # never away from the arm, whose reach is limited
+    )  # only towards the arm, whose reach is limited
     turned = replace(stated, yaw_rad=stated.yaw_rad + sign * np.deg2rad(degrees))
     middle = nodes[0].mean(axis=0)
     shift = stated.to_world(middle) - turned.to_world(middle)
@@ -362,13 +362,13 @@ def _misplaced(settings: RecorderSettings, nodes: Floats, rng: np.random.Generat
 
 
 def _write_log(writer: RawEpisodeWriter, robot: Robot, times: Floats, joints: Floats, settings: RecorderSettings) -> None:
-    """The joint log at its own rate: what the arm did `clock_offset_s` before each row's time.
+    """Write the joint log at its own rate. Each row has the arm's state `clock_offset_s` before the row's time.
 
-    Between the images it moves smoothly, at rest before the first and after the last.
+    The motion is interpolated smoothly between images, and at rest before the first and after the last.
 
     Args:
-        times: [T] of the images [s].
-        joints: [T, J] at these times [rad].
+        times: [T] times of the images [s].
+        joints: [T, J] joint angles at these times [rad].
     """
     start, end = times[0] - _BEFORE_S, times[-1] + _BEFORE_S
     clock = start + np.arange(int(np.ceil((end - start) * settings.joint_rate_hz)) + 1) / settings.joint_rate_hz

@@ -1,28 +1,29 @@
-"""Where the cameras stand, found again from the recording itself.
+"""Refinement of the camera poses from a recording itself.
 
-A calibration is off by millimetres once a camera has been touched, and by centimetres once the cameras' stand has been
-moved. The recording knows better: both cameras saw the arm, whose place its joints tell, the same table, and in part the
-same cloth. The poses are refined by Gauss–Newton on distances along normals, over several frames at once:
+A calibration is wrong by millimetres once a camera was touched, and by centimetres once the stand was moved. In the
+recording, both cameras see the arm, whose pose is known from its joints, the same table, and partly the same cloth. The
+poses are refined by Gauss–Newton on point-to-plane distances, over several frames at once:
 
-- arm: from each measured point to the described surface on its ray. How much thicker each link is than its description
-  (its *skin*), by how much each patch of it differs from that, and how late the joint log is are unknown too.
-- table: from the other camera's points to the first camera's plane.
-- cloth: from the other camera's points to the first camera's points nearby.
+- arm: from each measured point to the arm's model surface on its ray. Three more quantities are estimated: the excess
+  thickness of each link (its *skin*), the deviation of each surface patch from it, and the clock offset of the joint
+  log.
+- table: from the other cameras' points to the first camera's plane.
+- cloth: from the other cameras' points to the first camera's nearby points.
 
-An arm is rounder than its description, and cables lie on it. Such errors are the arm's own: the same place of a link is
-off by the same amount in every image of every camera. Taken for noise they become lag, because an arm that goes one way
-shows other places when it is fast than when it is slow. So each patch of a link has an offset of its own, which is
-eliminated, and the lag is read off how the same patches move.
+The real arm is rounder than its model and carries cables. Such errors belong to the arm: a patch of a link has the same
+error in every image of every camera. If they were treated as noise, they would bias the clock offset, because different
+patches are visible during fast and slow motion. So each patch has its own offset, which is eliminated, and the clock
+offset is determined by the motion of the same patches.
 
-Only the arm tells where all cameras together are. It is rounder and thicker than described, so its answer is no better than
-a usable calibration: a shift larger than that error (`_USABLE_M`) is applied; otherwise the first camera stays where it is.
-The shift is nevertheless estimated until the lag is found: cameras that are 3 mm off would make the log seem 5 ms late. If
-it is then within the accuracy with which it can be found (`_FOUND_M`), it is set to zero and the others' places are
+Only the arm determines the common pose of all cameras. Because of its model errors, this estimate is no better than a
+usable calibration. A common shift is applied only if it is larger than that error (`_USABLE_M`). Otherwise the first
+camera keeps its pose. The shift is estimated together with the clock offset, since an unmodelled shift of 3 mm would
+change the offset by 5 ms. If the shift is within its accuracy (`_FOUND_M`), it is set to zero and the other poses are
 estimated again.
 
-Weights come from the depth's own noise, and fall off for outliers by Tukey's function of the residuals' median deviation.
-Neighbouring points of table and cloth share their surface's errors, so they count as few. The calibration is the prior:
-what nothing in the recording constrains stays as it was.
+Weights follow from the depth noise; outliers get Tukey weights relative to the median absolute residual. Neighbouring
+points of table and cloth have correlated errors, so they have a smaller weight. The calibration is the prior, which
+determines all directions without information.
 """
 
 from __future__ import annotations
@@ -46,85 +47,85 @@ Floats = NDArray[np.float64]
 
 _ITERATIONS = 14
 _THICKENED_AT = 4
-"""Before this iteration the arm is cast as described, from it on as thick as it was found to be. A skin is not as thick
-along a ray as along the normal, and on round links the difference grows with the angle between them."""
+"""From this iteration on, the arm is rendered with the estimated skin. The thickness along a ray differs from that
+along the normal, and on round links the difference grows with the angle between both."""
 _CONVERGED = 2e-5
-"""Metres and radians of a step."""
+"""The iteration ends if the pose step is smaller than this [m, rad]."""
 _COLUMNS = 212
-"""Images are thinned to about this many columns: there are more points than the surface has shape."""
+"""Images are subsampled to about this many columns, which resolve the surfaces well enough."""
 _GATE_M = 0.03
-"""Farther from the described surface a measurement is of something else: three times what a usable calibration is off."""
+"""Measurements farther from the model surface are excluded [m]; three times the error of a usable calibration."""
 _CLOTH_GATE_M = 0.02
 _SHAPE_M = 0.002
-"""By which surfaces differ from their descriptions beyond a common skin, and depth is off beyond its noise."""
+"""Standard deviation of surface errors beyond the skin, and of depth errors beyond noise [m]."""
 _SHARED = 36
-"""So many thinned pixels lie on one patch of 4 cm at a metre, over which the errors of a surface are alike."""
+"""Number of subsampled pixels with correlated errors: those on a patch of 4 cm at 1 m."""
 _PATCH_M = 0.02
-"""Patches of the arm: cubes of this side in a link's frame, and in each the sides that face along one of its axes."""
+"""Size of the arm's patches [m]: cubes in the link's frame, divided by the main direction of the normal."""
 _PRIOR_PATCH_M = 0.003
-"""By which a patch differs from its link's description and skin: rounded edges, screws, cables."""
+"""Prior standard deviation of a patch's offset from model and skin [m]: rounded edges, screws, cables."""
 _CUBES = 1 << 12
-"""Patches are numbered within this many cubes along each axis."""
+"""Number of patch cubes along each axis."""
 _REWEIGHTED = 3
 _WINDOW = 4
-"""So many thinned pixels share a window of stereo matching, and with it their noise."""
+"""Number of subsampled pixels with correlated noise, because they share a stereo matching window."""
 _PRIOR_M, _PRIOR_RAD = 0.005, np.deg2rad(0.5)
-"""How far calibrations tend to be off, along and about each axis."""
+"""Prior standard deviations of calibration errors along and about each axis."""
 _USABLE_M, _USABLE_RAD = 0.005, np.deg2rad(0.5)
-"""A common shift of all cameras is left uncorrected if it is smaller than these limits."""
+"""Common shifts of all cameras below these limits are not applied."""
 _FOUND_M, _FOUND_RAD = 0.002, np.deg2rad(0.2)
-"""It is found as closely as this."""
+"""Accuracy with which the common shift can be estimated."""
 _PRIOR_SKIN_M, _PRIOR_LAG_S = 0.005, 0.1
 _LAG_STEP_S = 0.01
 _STEEPEST = 0.35
-"""Cosine between ray and normal below which a surface is seen too flatly."""
+"""Minimum cosine between ray and normal; surfaces seen at a flatter angle are excluded."""
 _NEIGHBOURS = 12
 
 
 @dataclass(frozen=True)
 class Sight:
-    """What the frames that are looked at show, each camera's points in its own frame."""
+    """Points of a few frames, each camera's in its own frame."""
 
     frames: Mapping[str, Sequence[int]]
-    """Indices of the images of each camera; those at one place in the lists belong together."""
+    """Indices of the images of each camera. Images at the same list position belong to the same time."""
     cloth: Mapping[str, Sequence[Floats]]
-    """[P, 3] of the cloth in each of these images, in the camera's frame [m]."""
+    """[P, 3] cloth points in each of these images, in the camera's frame [m]."""
     table: Mapping[str, Floats]
-    """[P, 3] on the table, in the camera's frame [m]; empty without a table."""
+    """[P, 3] table points in the camera's frame [m]; empty without a table."""
 
 
 @dataclass(frozen=True)
 class Refinement:
-    """The recording's own calibration."""
+    """Camera poses and clock offset found from a recording."""
 
     T_world_camera: Mapping[str, Floats]
-    """The first camera's is as it was, unless all cameras were found to be elsewhere."""
+    """Refined poses. The first camera's is unchanged unless a common shift of all cameras was applied."""
     skin_m: float
-    """By which the arm is thicker than described, as the median over the links that were seen; 0 without an arm."""
+    """Excess thickness of the arm, the median over the visible links; 0 without an arm."""
     clock_offset_s: float
-    """By which the joint log's times are late."""
+    """Offset of the joint log's times: logged time minus true time."""
     lag_sigma_s: float
-    """Standard deviation that it is known with; 0 without an arm."""
+    """Standard deviation of the clock offset; 0 without an arm."""
     shift_m: Mapping[str, float]
-    """How far each camera's picture of the middle of what was seen has moved."""
+    """Displacement of the scene's centre by the change of each camera's pose."""
 
 
 @dataclass(frozen=True)
 class _Rows:
-    """Linearised residuals."""
+    """Linearised residuals with their standard deviations."""
 
     J: Floats
-    """[N, 6] by a camera's rotation and translation, [N, 7 + L] also by the lag and the skin of each link, or [N, U] by
-    all unknowns."""
+    """[N, 6] derivatives with respect to a camera's rotation and translation. [N, 7 + L] has those of the clock offset
+    and each link's skin too, and [N, U] those of all unknowns."""
     r: Floats
-    """[N] [m]."""
+    """[N] residuals [m]."""
     sigma: Floats
-    """[N] their deviation [m]."""
+    """[N] standard deviations [m]."""
     patch: NDArray[np.int64] | None = None
-    """[N] numbers of the arm's patches; None for what is not of the arm."""
+    """[N] patch numbers of the arm; None for table and cloth."""
 
     def among(self, unknowns: int, columns: NDArray[np.int64]) -> _Rows:
-        """The same by all unknowns, of which J's are at these places."""
+        """Expand the derivatives to all unknowns; those in J belong to the given columns."""
         J = np.zeros((len(self.r), unknowns))
         J[:, columns] = self.J
         return replace(self, J=J)
@@ -142,10 +143,10 @@ def refine_extrinsics(
     """Refine the cameras' poses.
 
     Args:
-        views: by camera, at the calibration's poses.
-        arm: the described surface, without inflation; None without an arm.
+        views: cameras with the poses of the calibration.
+        arm: model surface without inflation; None without an arm.
         sigma_per_m: standard deviation of the inverse depth [1/m].
-        clock_offset_s: of the joint log, to start from.
+        clock_offset_s: initial clock offset of the joint log.
     """
     names, log = list(views), raw.robot
     first = names[0]
@@ -170,7 +171,7 @@ def refine_extrinsics(
         ]
     )
     found = np.zeros(len(prior))
-    """Corrections of the poses (the first camera's also moves all others) and of the lag, then the skins."""
+    """Corrections of the poses, the clock offset and the skins. That of the first camera also moves all others."""
     free, together, lag_variance = np.arange(len(prior)), np.eye(4), 0.0
     surface, thickened = arm, np.zeros(links)
     for iteration in range(_ITERATIONS):
@@ -186,7 +187,7 @@ def refine_extrinsics(
                 lag, skin = clock_offset_s + float(found[poses_end]), found[poses_end + 1 :] - thickened
                 rows = _arm_rows(log, surface, images[name], view, centre, skin, lag, sigma_per_m)
                 rows = rows.among(len(prior), np.concatenate([own, np.arange(poses_end, len(prior))]))
-                rows.J[:, :6] = rows.J[:, own]  # the first camera takes the others along
+                rows.J[:, :6] = rows.J[:, own]  # the first camera's correction moves all cameras
                 of_arm.append(rows)
             if index:
                 if plane is not None and len(sight.table[name]):
@@ -231,19 +232,19 @@ def refine_extrinsics(
 
 
 def _within(found: Floats, metres: float, radians: float) -> bool:
-    """Whether the first six numbers are a smaller motion than this."""
+    """Return whether a motion (rotation vector, translation) is below the given limits."""
     return bool(np.linalg.norm(found[:3]) < radians and np.linalg.norm(found[3:6]) < metres)
 
 
 @dataclass(frozen=True)
 class _Images:
-    """Thinned depth images of one camera."""
+    """Subsampled depth images of one camera."""
 
     view: View
     depth_m: Floats
-    """[F, h, w]."""
+    """[F, h, w] z-depth [m]."""
     times: Floats
-    """[F] [s]."""
+    """[F] times of the images [s]."""
 
 
 def _thinned(raw: RawEpisode, name: str, view: View, frames: Sequence[int]) -> _Images:
@@ -261,12 +262,12 @@ def _thinned(raw: RawEpisode, name: str, view: View, frames: Sequence[int]) -> _
 def _arm_rows(
     log: RobotLog, arm: RobotMask, images: _Images, view: View, centre: Floats, skin: Floats, lag: float, sigma_per_m: float
 ) -> _Rows:
-    """From each measurement near the arm to its surface on the same ray.
+    """Return the residuals from measurements near the arm to its surface on the same ray.
 
     Args:
-        arm: the surface that is cast.
-        skin: [L] by which the links are thicker than that [m].
-        lag: of the joint log [s].
+        arm: surface to render.
+        skin: [L] excess thickness of the links beyond that surface [m].
+        lag: clock offset of the joint log [s].
     """
     robot = arm.robot
     earlier, now, later = (
@@ -298,7 +299,7 @@ def _arm_rows(
 
 
 def _patches(link: NDArray[np.int64], place: Floats, normal: Floats) -> NDArray[np.int64]:
-    """Numbers [N] of the patches of places [N, 3] on links [N] with normals [N, 3], both in the links' frames."""
+    """Return patch numbers [N] of points `place` [N, 3] on links [N] with normals [N, 3], both in the links' frames."""
     axis = np.abs(normal).argmax(axis=1)
     side = 2 * axis + (np.take_along_axis(normal, axis[:, None], axis=1)[:, 0] > 0)
     cube = np.floor(place / _PATCH_M).astype(np.int64) + _CUBES // 2
@@ -307,19 +308,19 @@ def _patches(link: NDArray[np.int64], place: Floats, normal: Floats) -> NDArray[
 
 
 def _joined(parts: Sequence[_Rows]) -> _Rows:
-    """Rows of the arm together."""
+    """Concatenate rows of the arm."""
     return _Rows(*(np.concatenate([getattr(part, name) for part in parts]) for name in ("J", "r", "sigma", "patch")))
 
 
 def _normal_equations(rows: _Rows) -> tuple[Floats, Floats]:
-    """JᵀWJ [U, U] and -JᵀWr [U]; for rows of the arm, of what is left when the patches' offsets are eliminated."""
+    """Return JᵀWJ [U, U] and -JᵀWr [U]. For rows of the arm, the patches' offsets are eliminated."""
     if rows.patch is None:
         weighted = rows.J * (_tukey(rows.r / rows.sigma) / rows.sigma**2 / _SHARED)[:, None]
         return weighted.T @ rows.J, -weighted.T @ rows.r
     numbers, patch = np.unique(rows.patch, return_inverse=True)
     belongs = csr_array((np.ones(len(patch)), (patch, np.arange(len(patch)))), shape=(len(numbers), len(patch)))
     offset = np.zeros(len(numbers))
-    for _ in range(_REWEIGHTED):  # outliers are those from their own patch
+    for _ in range(_REWEIGHTED):  # outliers are relative to their own patch
         weight = _tukey((rows.r - offset[patch]) / rows.sigma) / rows.sigma**2 / _WINDOW
         total = belongs @ weight + 1 / _PRIOR_PATCH_M**2
         offset = belongs @ (weight * rows.r) / total
@@ -329,21 +330,21 @@ def _normal_equations(rows: _Rows) -> tuple[Floats, Floats]:
 
 
 def _table_rows(points: Floats, pose: Floats, plane: tuple[Floats, Floats], centre: Floats, sigma_per_m: float) -> _Rows:
-    """From points to the plane (a point of it, its normal)."""
+    """Return the residuals from points to the plane (a point on it, its normal)."""
     world, (place, normal) = transform(pose, points), plane
     off = (world - place) @ normal[0]
     return _plane_rows(world, np.broadcast_to(normal, world.shape), off, points, centre, sigma_per_m)
 
 
 def _placed(normals: Floats, points: Floats, pose: Floats) -> tuple[Floats, Floats]:
-    """Points [..., 3] and normals [..., 3] of a camera in the world."""
+    """Transform points [..., 3] and normals [..., 3] from the camera to the world."""
     return transform(pose, points), rotate(pose, normals)
 
 
 def _cloth_rows(
     clouds: Sequence[Floats], pose: Floats, surfaces: Sequence[tuple[Floats, Floats]], centre: Floats, sigma_per_m: float
 ) -> _Rows:
-    """From points to the tangent planes of the first camera's points nearby."""
+    """Return the residuals from points to the tangent planes of the first camera's nearby points."""
     worlds, normals, offsets, own = [], [], [], []
     for cloud, (points, normal) in zip(clouds, surfaces, strict=True):
         if not len(cloud) or not len(points):
@@ -362,21 +363,21 @@ def _cloth_rows(
 
 
 def _plane_rows(world: Floats, normal: Floats, r: Floats, points: Floats, centre: Floats, sigma_per_m: float) -> _Rows:
-    """Distances `r` of points along normals that stand still."""
+    """Return rows for distances `r` of points along fixed normals."""
     return _Rows(
         np.hstack([np.cross(world - centre, normal), normal]), r, np.hypot(sigma_per_m * points[:, 2] ** 2, _SHAPE_M)
     )
 
 
 def _tukey(u: Floats) -> Floats:
-    """[N] weights 0..1 of residuals over their deviations."""
+    """Return weights [N], 0 to 1, of residuals divided by their standard deviations."""
     if not len(u):
         return np.zeros(0)
     return tukey(u, deviation(u) + 1e-9)
 
 
 def _image_normals(points: Floats, solid: NDArray[np.bool_], directions: Floats) -> tuple[Floats, Floats]:
-    """Normals [H, W, 3] of an image of points, towards the camera, and the cosine [H, W] to the rays; 0 at borders."""
+    """Return normals [H, W, 3] of an image of points, and cosines [H, W] to the rays; 0 at borders."""
     across = np.zeros_like(points)
     down = np.zeros_like(points)
     across[:, 1:-1] = points[:, 2:] - points[:, :-2]
@@ -391,7 +392,7 @@ def _image_normals(points: Floats, solid: NDArray[np.bool_], directions: Floats)
 
 
 def _with_normals(points: Floats) -> tuple[Floats, Floats]:
-    """Points [P, 3] and the normals [P, 3] of the planes through their neighbours; both empty for too few."""
+    """Return points [P, 3] and normals [P, 3] of planes through their neighbours; empty for too few points."""
     if len(points) <= _NEIGHBOURS:
         return np.zeros((0, 3)), np.zeros((0, 3))
     _, nearest = cKDTree(points).query(points, k=_NEIGHBOURS)
@@ -401,7 +402,7 @@ def _with_normals(points: Floats) -> tuple[Floats, Floats]:
 
 
 def _plane(points: Floats) -> tuple[Floats, Floats] | None:
-    """The normal [1, 3] of the plane through points [P, 3], and a point of it [1, 3]."""
+    """Return the normal [1, 3] of the plane through points [P, 3], and a point on it [1, 3]."""
     if len(points) < 3:
         return None
     centre = points.mean(axis=0, keepdims=True)
@@ -409,7 +410,7 @@ def _plane(points: Floats) -> tuple[Floats, Floats] | None:
 
 
 def _moved(pose: Floats, step: Floats, centre: Floats) -> Floats:
-    """A pose turned about `centre` by a rotation vector step[:3], then moved by step[3:]."""
+    """Rotate a pose about `centre` by a rotation vector step[:3], then shift it by step[3:]."""
     turn = Rotation.from_rotvec(step[:3]).as_matrix()
     moved = pose.copy()
     moved[:3, :3] = turn @ pose[:3, :3]

@@ -1,7 +1,7 @@
-"""Where an arm's links are: forward kinematics, and the joint angles that bring the tool somewhere.
+"""Robot kinematics: link poses from joint angles, and joint angles from tool poses.
 
-World is the robot's base frame, which is the frame of the description's root link. The arm is the chain of moving joints
-from the root to the tool link; whatever else moves (a gripper's fingers) follows the gripper's state.
+The world frame is the robot's base frame, i.e. that of the model's root link. The arm is the chain of moving joints
+from the root to the tool link. All other moving joints (the gripper's fingers) follow the gripper's state.
 """
 
 from __future__ import annotations
@@ -26,25 +26,23 @@ GEN3_HOME_RAD = np.deg2rad([0.0, 15.0, 180.0, -130.0, 0.0, 55.0, 90.0])
 _DAMPING = 1e-3
 _ROUNDING_M = 1e-6
 _LONGEST_STEP_RAD = 0.3
-"""Beyond, the linear model of the arm no longer holds."""
+"""Maximum step; the linearisation is inaccurate beyond."""
 
 
 def gen3() -> Robot:
-    """The package's own Kinova Gen3 (7 joints) with a Robotiq 2F-85: published joint constants, cylinders and boxes.
-
-    The links cover the makers' surfaces to 5 mm (measured at the vertices of their meshes).
-    """
+    """Return the package's own Kinova Gen3 (7 joints) with a Robotiq 2F-85: published joint constants, cylinders and
+    boxes. The links cover the manufacturers' surfaces to within 5 mm (measured at the vertices of their meshes)."""
     with as_file(files("diffcloud.sensing") / "gen3_robotiq_2f_85.urdf") as path:
         return Robot.from_urdf(path)
 
 
 @dataclass(frozen=True)
 class Robot:
-    """A robot's kinematics."""
+    """Kinematics of a robot."""
 
     description: RobotDescription
     tool: str = TOOL_LINK
-    """Link whose pose is the tool's."""
+    """Link whose pose is the tool pose."""
 
     def __post_init__(self) -> None:
         if self.tool not in self.links:
@@ -52,26 +50,26 @@ class Robot:
 
     @staticmethod
     def from_urdf(path: Path, *, tool: str = TOOL_LINK) -> Robot:
-        """From a URDF file.
+        """Read a robot from a URDF file.
 
         Raises:
-            RobotError: see `read_urdf`; or no link of that name.
+            RobotError: see `read_urdf`; or the tool link is missing.
         """
         return Robot(read_urdf(path), tool)
 
     @cached_property
     def links(self) -> tuple[str, ...]:
-        """L names, in the order of `forward_kinematics`."""
+        """Names of the L links, in the order of `forward_kinematics`."""
         return tuple(link_names(self.description))
 
     @cached_property
     def moving(self) -> tuple[Joint, ...]:
-        """The A joints that have an angle of their own, in the order of a configuration."""
+        """The A independent joints, in the order of a configuration."""
         return tuple(joint for joint in self.description.joints if joint.kind != "fixed" and joint.mimic is None)
 
     @cached_property
     def arm(self) -> NDArray[np.int64]:
-        """[J] places in a configuration of the joints that carry the tool, from the root outwards."""
+        """[J] indices in a configuration of the joints that carry the tool, from the root outwards."""
         carrier = {joint.child: joint for joint in self.description.joints}
         chain, link = [], self.tool
         while link in carrier:
@@ -80,15 +78,15 @@ class Robot:
         return np.array([index for index, joint in enumerate(self.moving) if joint.name in chain], dtype=np.int64)
 
     def configuration(self, joints_rad: Floats, gripper: Floats | float = 0.0) -> Floats:
-        """[..., A] angles of all moving joints.
+        """Return the angles [..., A] of all moving joints.
 
         Args:
-            joints_rad: [..., J] of the arm, from the base to the tool.
-            gripper: [...] 0 open to 1 closed; spans the limits of the other joints (`fingers`). NaN (not known) is taken as
-                open, when the fingers reach farthest.
+            joints_rad: [..., J] arm joints, from the base to the tool.
+            gripper: [...] 0 open to 1 closed; the other joints are interpolated between their limits (`fingers`). NaN
+                (unknown) is treated as open, because the fingers then reach farthest.
 
         Raises:
-            RobotError: another number of joints than the arm has.
+            RobotError: the number of joints differs from the arm's.
         """
         joints_rad = np.asarray(joints_rad, dtype=np.float64)
         if joints_rad.shape[-1:] != (len(self.arm),):
@@ -104,11 +102,9 @@ class Robot:
 
     @cached_property
     def fingers(self) -> tuple[Floats, Floats]:
-        """[A] of all moving joints where the gripper is open, and closed: the ends of their limits; zero without limits.
-
-        A description does not say which end is which. A Robotiq 2F-85 is open at the lower one, a Franka Hand at the upper:
-        at the one where the surfaces that fingers move are spread wider.
-        """
+        """[A] configurations with open and with closed gripper, at the limits of the finger joints; zero for joints
+        without limits. The model does not state which limit is open. A Robotiq 2F-85 is open at the lower limit, a
+        Franka Hand at the upper. So the limit at which the fingers' surfaces are farther apart is taken as open."""
         low, high = (np.array([getattr(joint, end) for joint in self.moving]) for end in ("lower", "upper"))
         bounded = np.isfinite(low) & np.isfinite(high)
         low, high = np.where(bounded, low, 0.0), np.where(bounded, high, 0.0)
@@ -116,7 +112,7 @@ class Robot:
         return (high, low) if self._spread(high) > self._spread(low) + _ROUNDING_M else (low, high)
 
     def _spread(self, configuration: Floats) -> float:
-        """[m] RMS distance from their middle of the corners of all links that fingers move; 0 where there is none."""
+        """Return the RMS distance [m] of the corners of all finger links from their mean; 0 without such links."""
         poses = self.forward_kinematics(configuration)
         own = {self.moving[index].name for index in range(len(self.moving)) if index not in self.arm}
         moved = set[str]()
@@ -135,7 +131,7 @@ class Robot:
         return float(np.sqrt(((points - points.mean(axis=0)) ** 2).sum(axis=1).mean()))
 
     def forward_kinematics(self, configuration: Floats) -> Floats:
-        """[..., L, 4, 4] T_world_link of all links for configurations [..., A] [rad or m]."""
+        """Return T_world_link [..., L, 4, 4] of all links for configurations [..., A] [rad or m]."""
         configuration = np.asarray(configuration, dtype=np.float64)
         if configuration.shape[-1:] != (len(self.moving),):
             raise RobotError(
@@ -158,11 +154,11 @@ class Robot:
         return poses
 
     def tool_pose(self, joints_rad: Floats) -> Floats:
-        """[..., 4, 4] T_world_tool for arm joints [..., J]."""
+        """Return T_world_tool [..., 4, 4] for arm joints [..., J]."""
         return self.forward_kinematics(self.configuration(joints_rad))[..., self.links.index(self.tool), :, :]
 
     def jacobian(self, joints_rad: Floats) -> Floats:
-        """[..., 6, J] velocity [m] and angular velocity [rad] of the tool in the world, per joint velocity."""
+        """Return the tool's velocity [m] and angular velocity [rad] in the world per joint velocity, [..., 6, J]."""
         return self._tool_and_jacobian(joints_rad)[1]
 
     def inverse_kinematics(
@@ -174,18 +170,19 @@ class Robot:
         tolerance_m: float = 1e-5,
         iterations: int = 200,
     ) -> Floats:
-        """Joint angles [..., J] that bring the tool to `positions`: damped least squares on all poses at once.
+        """Return joint angles [..., J] that bring the tool to `positions`, by damped least squares for all poses at
+        once.
 
         All poses start from the same configuration, so a smooth path of the tool gives a smooth path of the joints.
 
         Args:
-            positions: [..., 3] of the tool in the world [m].
-            rotations: [..., 3, 3] or [3, 3] T_world_tool's rotation; None leaves it free.
-            start_rad: [J] or [..., J].
-            tolerance_m: largest distance left; of rotations the same number in radians.
+            positions: [..., 3] tool positions in the world [m].
+            rotations: [..., 3, 3] or [3, 3] rotation of T_world_tool; None leaves it free.
+            start_rad: [J] or [..., J] initial joint angles.
+            tolerance_m: maximum remaining distance; for rotations the same number in radians.
 
         Raises:
-            RobotError: a pose out of reach: says which, and by how much it is missed.
+            RobotError: a pose is out of reach; names the pose and the remaining error.
         """
         positions = np.asarray(positions, dtype=np.float64)
         joints = np.broadcast_to(start_rad, (*positions.shape[:-1], len(self.arm))).copy()
@@ -202,7 +199,7 @@ class Robot:
                 return joints
             J = jacobian[..., :rows, :]
             Jt = np.swapaxes(J, -1, -2)
-            # the damping fades with the error, so that the last steps are Newton's
+            # the damping decreases with the error, so that the last steps are Newton steps
             damping = _DAMPING * np.minimum(1.0, np.square(error).sum(axis=-1))[..., None, None] + 1e-9
             step = (Jt @ np.linalg.solve(J @ Jt + damping * np.eye(rows), error[..., None]))[..., 0]
             longest = np.abs(step).max(axis=-1, keepdims=True)
@@ -218,7 +215,7 @@ class Robot:
         poses = self.forward_kinematics(self.configuration(joints_rad))
         tool = poses[..., self.links.index(self.tool), :, :]
         carried = [self.links.index(self.moving[index].child) for index in self.arm]
-        # a joint's motion leaves its own axis where it is: the child's frame gives the axis, and a point on it
+        # a joint does not move its own axis, so the child's frame gives the axis and a point on it
         frames = poses[..., carried, :, :]
         axis = (frames[..., :3, :3] @ np.array([self.moving[index].axis for index in self.arm])[..., None])[..., 0]
         lever = tool[..., None, :3, 3] - frames[..., :3, 3]
@@ -229,7 +226,7 @@ class Robot:
 
 
 def _motion(joint: Joint, value: Floats) -> Floats:
-    """[..., 4, 4] of a joint at angles or lengths [...]."""
+    """Return transforms [..., 4, 4] of a joint at angles or displacements [...]."""
     matrix = np.zeros((*value.shape, 4, 4))
     matrix[..., :, :] = np.eye(4)
     if joint.kind == "prismatic":

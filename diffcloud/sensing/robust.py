@@ -1,4 +1,4 @@
-"""Deviations and weights that outliers hardly move."""
+"""Robust standard deviations and weights."""
 
 from __future__ import annotations
 
@@ -8,17 +8,17 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 
 _TO_DEVIATION = 1.4826
-"""From the median of absolute errors to the standard deviation of normal ones."""
+"""Ratio of the standard deviation to the median absolute error, for normal errors."""
 _TUKEY = 4.685
-"""Of the residuals' standard deviation: 95 % efficient on normal noise."""
+"""Cutoff of Tukey's biweight in standard deviations, with 95 % efficiency for normal noise."""
 
 
 def deviation(errors: Floats) -> float:
-    """Standard deviation of errors [N], from the median of their sizes."""
+    """Estimate the standard deviation of errors [N] from their median absolute value."""
     return _TO_DEVIATION * float(np.median(np.abs(errors)))
 
 
 def tukey(errors: Floats, sigma: float) -> Floats:
-    """[N] weights 0..1 of errors with this standard deviation (Tukey's biweight)."""
+    """Return Tukey biweights [N], 0 to 1, of errors with this standard deviation."""
     weight: Floats = np.square(1 - np.minimum(np.abs(errors) / (_TUKEY * sigma), 1.0) ** 2)
     return weight

@@ -1,9 +1,9 @@
-"""Smoothing of stereo depth that keeps borders where they are.
+"""Edge-preserving smoothing of stereo depth.
 
-What a stereo camera measures is disparity, the inverse of depth, with the same noise at all distances; along a plane it is
-linear in the image. So the mean of a pixel's two opposite neighbours estimates the pixel without flattening a slope. Pairs
-whose mean is farther from the pixel than noise explains, such as those across a border, do not count. At a border the
-pairs that would reach over it are missing on both sides; nothing is pulled inwards.
+A stereo camera measures disparity, the inverse of depth, with the same noise at all distances. Disparity of a plane is
+linear in the image. So the mean of two opposite neighbours estimates a pixel without flattening a slope. Pairs whose
+mean differs from the pixel by more than noise are skipped, such as those across a border. At a border, pairs are
+missing on both sides, so the border does not shift.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ _DEVIATIONS = 3.0
 
 
 def smooth_depth(depth_m: Floats, use: NDArray[np.bool_], radius_px: int, sigma_per_m: float) -> Floats:
-    """Depth [H, W] [m] with the pixels in `use` averaged over their surroundings; the others are unchanged.
+    """Return depth [H, W] [m] with the pixels in `use` averaged over their neighbourhood; other pixels are unchanged.
 
     Args:
-        use: [H, W] pixels that are smoothed, and that smooth; they have depth.
-        radius_px: half the side of the square of neighbours.
+        use: [H, W] pixels with depth that are smoothed and averaged.
+        radius_px: half the side of the square neighbourhood.
         sigma_per_m: standard deviation of the inverse depth [1/m].
     """
     inverse = np.zeros_like(depth_m)
@@ -29,11 +29,11 @@ def smooth_depth(depth_m: Floats, use: NDArray[np.bool_], radius_px: int, sigma_
     padded, allowed = np.pad(inverse, radius_px), np.pad(use, radius_px)
     height, width = depth_m.shape
     total, count = inverse.copy(), np.ones_like(depth_m)
-    # a pair's mean has half the variance of one pixel; it is compared with one
+    # the variances of the pair's mean (1/2) and of the pixel (1) add up
     tolerance = _DEVIATIONS * np.sqrt(1.5) * sigma_per_m
 
     span = range(-radius_px, radius_px + 1)
-    for row, column in ((r, c) for r in span for c in span if (r, c) > (0, 0)):  # half the square: one of each pair
+    for row, column in ((r, c) for r in span for c in span if (r, c) > (0, 0)):  # one offset of each pair
         there, opposite = (
             (slice(radius_px + r, radius_px + r + height), slice(radius_px + c, radius_px + c + width))
             for r, c in ((row, column), (-row, -column))

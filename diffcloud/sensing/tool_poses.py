@@ -1,4 +1,4 @@
-"""What is wrong with the poses of the tool in a joint log: its units, its frame, its quaternions."""
+"""Checks of the tool poses in a joint log: units, frame and quaternions."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 
 _LONGEST_REACH_M = 3.0
-"""No arm of this kind reaches farther."""
+"""Upper limit of the reach of such arms [m]."""
 _LENGTH_OFF = 0.01
 _TURNED = np.deg2rad(10.0)
 
 
 def unreachable(positions: Floats) -> str | None:
-    """Why tool positions [N, 3], some of them NaN, are none that an arm reaches; None where they are."""
+    """Explain why tool positions [N, 3] are out of an arm's reach; None if they are reachable. NaN is ignored."""
     known = positions[np.isfinite(positions).all(axis=1)]
     farthest = float(np.linalg.norm(known, axis=1).max()) if len(known) else 0.0
     if farthest <= _LONGEST_REACH_M:
@@ -27,7 +27,7 @@ def unreachable(positions: Floats) -> str | None:
 
 
 def not_unit(quaternions: Floats) -> str | None:
-    """Why tool orientations [N, 4], some of them NaN, are no unit quaternions; None where they are."""
+    """Explain why tool orientations [N, 4] are no unit quaternions; None if they are. NaN is ignored."""
     lengths = np.linalg.norm(quaternions, axis=1)
     lengths = lengths[np.isfinite(lengths)]
     if not len(lengths) or np.abs(lengths - 1).max() <= _LENGTH_OFF:
@@ -40,8 +40,11 @@ def not_unit(quaternions: Floats) -> str | None:
 
 
 def turning(quaternions: Floats) -> str | None:
-    """Why the track of the tool may not be that of its fingertips, from its orientations [N, 4] (w, x, y, z), some of them
-    NaN; None where it hardly turns."""
+    """Warn if the tool rotates, since its track then differs from that of the fingertips; None if it hardly rotates.
+
+    Args:
+        quaternions: [N, 4] orientations (w, x, y, z); NaN is ignored.
+    """
     lengths = np.linalg.norm(quaternions, axis=1)
     known = quaternions[np.abs(lengths - 1) <= _LENGTH_OFF]
     if not len(known):

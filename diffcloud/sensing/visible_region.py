@@ -1,4 +1,4 @@
-"""Planes at which the points of each camera were cut off, found from a recording."""
+"""Crop planes of each camera, estimated from a recording."""
 
 from __future__ import annotations
 
@@ -10,14 +10,15 @@ from diffcloud.io.episodes import Episode
 
 
 def with_cut_planes(episode: Episode) -> Episode:
-    """State below which height each camera's points were removed together with the table.
+    """Add to the meta the height below which each camera's points were removed together with the table.
 
     Args:
-        episode: each point names its camera, and the meta lists the `cameras`.
+        episode: recording in which each point has its camera, and whose meta has `cameras`.
 
     Returns:
-        Its meta has `cut_planes`: camera -> [a, b, c, d]. The camera shows only points (x, y, z) of the scene with
-        a x + b y + c z >= d. Here it is the height of the camera's lowest point. A camera without points has none.
+        An episode whose meta has `cut_planes`: camera -> [a, b, c, d]. The camera's points satisfy a x + b y + c z >=
+            d. The plane is horizontal, at the height of the camera's lowest point. A camera without points has no
+            plane.
     """
     assert episode.camera is not None
     heights = {

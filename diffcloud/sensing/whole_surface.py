@@ -1,4 +1,4 @@
-"""A recorder of no camera: the whole surface of a known motion, without noise."""
+"""Noise-free episodes sampled from the whole surface of a known motion, without a camera."""
 
 from __future__ import annotations
 
@@ -24,18 +24,18 @@ def sample_surface(
     seed: int,
     meta: Mapping[str, Any],
 ) -> Episode:
-    """A fully observed episode without noise, as the paper's simulated targets are.
+    """Return a noise-free, fully observed episode, like the simulated targets of the paper.
 
-    Points are drawn anew in every frame, uniformly by area, on the cloth and the obstacle together; also where nothing
-    could see them. The episode carries no gripper track, so that a fit moves the handles exactly as the scene does.
+    Points are sampled separately in every frame, uniformly by area on cloth and obstacle, also where they would be
+    occluded. The episode has no gripper track, so that a fit moves the handles exactly as the scene does.
 
     Args:
-        nodes: [T, V, 3] of the cloth at each frame [m].
+        nodes: [T, V, 3] cloth nodes at each frame [m].
         faces: [F, 3].
         times: [T] [s].
         obstacle: a fixed body beside the cloth; None for the cloth alone.
-        points: in each frame.
-        seed: of the points.
+        points: number of points per frame.
+        seed: seed of the samples.
     """
     generator = torch.Generator().manual_seed(seed)
     if obstacle is not None:

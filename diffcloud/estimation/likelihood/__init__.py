@@ -1,24 +1,25 @@
-"""The parameters of a cloth and how well its recordings show them, for a model that cannot predict all of a motion.
+"""Maximum-likelihood estimate of cloth parameters and its uncertainty, for a model that cannot predict the whole
+motion.
 
-A frame t has a mean squared distance m from simulated to recorded points and another from recorded to simulated ones. Each
-has a variance v that is known: noise and spacing of the points, one squared millimetre, and the squared half of what a mesh
-of half the edge length changes there. What the model lacks beside that is not known, so each frame has a factor s >= 1 on
-its variances, which the likelihood chooses. With c the mean of m / v over both ways, s = max(1, c), and
+A frame t has a mean squared distance m from simulated to recorded points, and another one in the opposite direction.
+Each has a known variance v. It consists of noise and spacing of the points, 1 mm², and the square of half the
+displacement that mesh refinement causes. Further model errors are unknown. So the variances of each frame have a factor
+s >= 1, which is chosen by maximum likelihood. With c, the mean of m / v over both directions, s = max(1, c), and
 
     Φ = Σ_t n (log v_t + ρ(c_t)) + prior,      ρ(c) = c up to 1, 1 + log c above,
 
-is twice the negative logarithm of the likelihood of n independent residuals a frame, and of the priors. Errors of a model
-are correlated over a cloth, so n is far below the number of points.
+is twice the negative log-posterior, for n independent residuals per frame. Model errors are correlated over the cloth,
+so n is much smaller than the number of points.
 
-After some time nobody can predict which fold forms: there, derivatives explode. Frames count up to a horizon, where the
-finer mesh and the given one part. The finer mesh also corrects the positions: its difference to the given mesh is added to
-the simulated nodes. What half of that difference would change is a part of the uncertainty. A recording that this simulator
-made on the same mesh needs none of that: there, the horizon bounds the descents, and the best answer goes on with all
-frames if it can.
+After some time the folding of a cloth is unpredictable, and derivatives explode. Frames are therefore used only up to a
+horizon, at which the refined and the given mesh diverge from each other. The refined mesh also corrects the positions:
+its displacement is added to the simulated nodes. Half of this displacement is treated as an uncertainty. Recordings
+that this simulator made on the same mesh need no correction. For them the horizon only limits the descents, and the
+best result is refined on all frames if possible.
 
-The variables are those of the space, the pose of each recording, and the size of the grasp where that is not known. What
-the grasp's size changes is interpolated between three sizes; the first start tells which ones. Gauss and Newton's steps,
-bounded in each variable, go from three starts; the answers are weighed by their likelihoods.
+The variables are those of the space, the pose of each recording, and the size of the grasp if it is unknown. The effect
+of the grasp size is interpolated between three sizes, which are centred on the result of the first start. Gauss–Newton
+steps with a bound in each variable are taken from three starts. The results are weighted by their likelihoods.
 """
 
 from diffcloud.estimation.likelihood.descent import Answer

@@ -1,4 +1,4 @@
-"""A descent of Φ from one start, and what is known where it ends."""
+"""Descent of Φ from one start, with the uncertainty at its end. Φ is defined in `estimation.likelihood`."""
 
 from __future__ import annotations
 
@@ -20,47 +20,48 @@ from diffcloud.scene.scenarios import Scenario
 from diffcloud.sim.threads import map_threads
 
 _RADIUS = 1.0
-"""Of a step, in each variable."""
+"""Largest step in each variable, in fit coordinates."""
 _SMALL = 0.25
-"""A step this small ends a descent, in standard deviations."""
+"""A descent ends if its step is smaller than this, in standard deviations."""
 _FEWEST_STEPS = 3
-"""Of a descent."""
+"""Minimum number of steps in a descent."""
 _RISE = 0.02
-"""By which Φ may rise, for each independent residual."""
+"""Allowed increase of Φ in a step, per independent residual."""
 _BACKTRACKS = 3
 _REFRESH = 1.0
-"""Standard deviations after which the finer mesh is simulated anew."""
+"""The refined mesh is simulated again after a change of this size, in standard deviations."""
 _NARROW = 0.05
-"""Least bound on a step, where a start diverges or rises."""
+"""Smallest bound on a step after divergence or an increase of Φ."""
 _GAINS, _BEHIND = 3.0, 20.0
-"""A start ends where so many times what its next step promises would leave its Φ so far above the best."""
+"""A start is abandoned if its expected Φ is above the best one by more than the second number. The expected Φ is its
+current value minus the first number times the gain that the next step predicts."""
 
 
 @dataclass(frozen=True)
 class Answer:
-    """Where one start ended."""
+    """Result of one start."""
 
     place: Tensor
-    """[K] variables of the space on their axis; then the pose of each recording and, last, the size of the grasp where it
-    is not known, in deviations of their priors."""
+    """[K] fit coordinates of the space, then the pose of each recording and the grasp size if unknown, the latter two
+    in standard deviations of their priors."""
     covariance: Tensor
-    """[K, K]"""
+    """[K, K] covariance of the variables."""
     sources: Mapping[str, Tensor]
-    """Source -> its part of the covariance [K, K]."""
+    """Source of uncertainty -> its contribution to the covariance [K, K]."""
     energy: float
-    """Φ"""
+    """Value of Φ."""
     converged: bool
     chi_squares: tuple[list[float], ...]
-    """Of each recording, c of its frames."""
+    """For each recording, c of its frames."""
     apart_m: tuple[list[float], ...]
-    """Of each recording, how far the finer mesh is in its frames, RMS over the nodes."""
+    """For each recording, the RMS node displacement by mesh refinement in its frames [m]."""
     trace: tuple[tuple[float, Tensor], ...]
-    """Mean squared distance and place at each step."""
+    """Mean squared distance and coordinates at each step."""
 
 
 @dataclass(frozen=True)
 class Reached:
-    """The last place of a descent that counts."""
+    """Last accepted iterate of a descent."""
 
     place: Tensor
     linear: list[Linear]
@@ -72,22 +73,23 @@ class Reached:
 
 
 class Descent:
-    """From one start."""
+    """Descent of Φ from one start."""
 
     def __init__(self, likelihood: Likelihood, place: Tensor, tell: Callable[[int, float, Tensor], None]) -> None:
-        """
+        """Prepare a descent.
+
         Args:
-            tell: takes step, mean squared distance, and place.
+            tell: progress callback. Its arguments are step, mean squared distance and coordinates.
         """
         self.of, self.place, self._tell = likelihood, place, tell
         self.reached: Reached | None = None
         self._trace: list[tuple[float, Tensor]] = []
 
     def run(self, to_beat: float) -> Answer | None:
-        """Where it ends; None where it falls behind.
+        """Return the result, or None if the start is abandoned.
 
         Args:
-            to_beat: Φ of a better answer.
+            to_beat: Φ of the best result of other starts.
         """
         of, place, radius, tried = self.of, self.place, _RADIUS, 0
         allowed = _RISE * sum(one.independent * len(one.objective.frames) for one in of.recordings)
@@ -111,7 +113,7 @@ class Descent:
                 continue
             tried = 0
             step = self._step(terms, place, radius)
-            if bool((step[of.asked].abs() < radius).all()) and self._stale(terms, place):  # on its way it need not know
+            if bool((step[of.asked].abs() < radius).all()) and self._stale(terms, place):  # only near convergence
                 self._look(linear, place)
                 terms = self._terms(linear, place)
                 step = self._step(terms, place, radius)
@@ -137,13 +139,13 @@ class Descent:
         return map_threads(lambda one: Linear.at(one, place), self.of.recordings)
 
     def _stale(self, terms: Terms, place: Tensor) -> bool:
-        """Whether the finer mesh was last simulated too far away."""
+        """Return whether the refined mesh was last simulated too far away."""
         assert self.of.looked is not None
         away = (place - self.of.looked).abs() / terms.deviations
         return bool((away[self.of.asked] > _REFRESH).any())
 
     def _look(self, linear: Sequence[Linear], place: Tensor) -> None:
-        """Simulate the finer mesh here, and another grasp."""
+        """Simulate the refined mesh and the other grasp sizes at this point."""
         self.of.looked = place
 
         def look(one: Linear, old: Changes) -> Changes:
@@ -154,7 +156,7 @@ class Descent:
         self.of.changes = map_threads(lambda pair: look(*pair), [*zip(linear, self.of.changes, strict=True)])
 
     def _changed(self, one: Linear, place: Tensor, variant: Scenario) -> Tensor | None:
-        """By how much a variant of the scenario moves the nodes; None where it diverges."""
+        """Return the node displacements that a scenario variant causes; None if it diverges."""
         self.of.simulations += 1
         try:
             return one.recording.change(place, one.nodes, variant)
@@ -175,7 +177,7 @@ class Descent:
         return Terms(energy, slope, matrix, float(np.mean(squares)))
 
     def answer(self, *, converged: bool) -> Answer:
-        """Of the place that was reached."""
+        """Return the result at the last accepted iterate."""
         assert self.reached is not None
         place, terms, of = self.reached.place, self.reached.terms, self.of
         covariance = terms.covariance

@@ -1,4 +1,4 @@
-"""Φ of all recordings, over the variables of the space, the poses, and the size of the grasp."""
+"""Φ of all recordings as a function of parameters, poses and grasp size. `estimation.likelihood` defines Φ."""
 
 from __future__ import annotations
 
@@ -19,26 +19,27 @@ from diffcloud.estimation.residuals import Axis
 from diffcloud.sim.threads import map_threads
 
 _PART_M, _GONE_M = 0.004, 0.010
-"""Difference to the finer mesh, RMS over the nodes, at which the horizon is: after `_LEAST_S`, and before it."""
+"""RMS displacement by mesh refinement [m] at the horizon, after `_LEAST_S` and before."""
 _LEAST_S = 1.2
-"""A first guess of the material may part too early."""
+"""Time [s] up to which the horizon is less strict, because a poor initial material may diverge too early."""
 _FAR = 100.0
-"""Bound on a pose, in deviations."""
+"""Bound on a pose variable, in standard deviations."""
 _FAR_GRIP = 2.0
-"""And on the size of a grasp: what it changes is known in between -1 and 1."""
+"""Bound on the grasp size, in standard deviations. Its effect is interpolated between -1 and 1."""
 _EDGE = 1e-6
-"""Distance from a bound, where nothing would pull back."""
+"""Minimum distance from a bound, in fit coordinates."""
 
 
 class Likelihood:
-    """Φ of all recordings."""
+    """Objective Φ of all recordings, with its variables and their priors."""
 
     def __init__(
         self, objectives: Sequence[Objective], space: FitSpace, settings: LikelihoodSettings, grip: float = 0.0
     ) -> None:
-        """
+        """Set up the variables of all recordings.
+
         Args:
-            grip: of the scenarios, in deviations from the size that was given.
+            grip: grasp size of the scenarios, in standard deviations from the stated size.
         """
         self.space, self.axis, self.iterations = space, Axis.of(space), settings.max_steps
         self.recordings, self.simulations, self.grip = list[Recording](), 0, grip
@@ -52,7 +53,7 @@ class Likelihood:
         self.asked = torch.tensor(asked, dtype=torch.long)
         self.changes = [Changes() for _ in self.recordings]
         self.looked: Tensor | None = None
-        """Where these were last found."""
+        """Coordinates at which `changes` was last computed."""
         self.knows_grip = not any(one.regripped for one in self.recordings)
         self.poses = count - variables
         steps, poses = space.prior_steps(), torch.ones(self.poses + (not self.knows_grip), dtype=torch.float64)
@@ -67,7 +68,7 @@ class Likelihood:
 
     @property
     def frames(self) -> int:
-        """Compared, of all recordings."""
+        """Number of compared frames in all recordings."""
         return sum(len(one.objective.frames) for one in self.recordings)
 
     def inside(self, place: Tensor) -> Tensor:
@@ -77,7 +78,7 @@ class Likelihood:
         return torch.where(self.precision > 0, place - self.centre, 0.0)
 
     def horizons(self, place: Tensor) -> tuple[int, ...]:
-        """Of each recording, how many of its frames come before the finer mesh parts from the given one."""
+        """Return for each recording the number of frames before the refined and the given mesh diverge."""
 
         def one(recording: Recording) -> int:
             change = recording.change(place, recording.nodes(place), recording.finer)
@@ -90,7 +91,12 @@ class Likelihood:
         return tuple(map_threads(one, self.recordings))
 
     def start(self, init: Mapping[str, float], offset: float) -> Tensor:
-        """[K] these values, else the centres of the priors, and with the first variable so far off on its axis."""
+        """Return start coordinates [K] from these values, or else from the centres of the priors.
+
+        Args:
+            init: name -> value.
+            offset: shift of the first variable, in fit coordinates.
+        """
         place = self.centre.clone()
         for index, name in enumerate(self.space.names):
             if name in init:
@@ -102,13 +108,13 @@ class Likelihood:
 
 @dataclass(frozen=True)
 class Terms:
-    """Φ at a place, and how it changes."""
+    """Φ at one point, with half its gradient and half its Gauss–Newton matrix."""
 
     energy: float
     slope: Tensor
-    """[K] half of it."""
+    """[K] half the gradient."""
     matrix: Tensor
-    """[K, K] half of the Gauss–Newton matrix."""
+    """[K, K] half the Gauss–Newton matrix."""
     square: float
     """Mean squared distance."""
 
@@ -128,11 +134,11 @@ def up_to_horizon(
     grip: float = 0.0,
     place: Tensor | None = None,
 ) -> Likelihood:
-    """Of the frames that count.
+    """Return the likelihood of the frames up to the horizon.
 
     Args:
-        grip: in deviations from the size that was given.
-        place: where the horizon is looked for; by default where the first start begins.
+        grip: grasp size, in standard deviations from the stated size.
+        place: coordinates at which the horizon is determined; by default those of the first start.
     """
     members = gripped(members, grip)
     whole = Likelihood(members, space, settings, grip)

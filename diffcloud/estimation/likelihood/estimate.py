@@ -1,4 +1,4 @@
-"""Descents from several starts, weighed by their likelihoods."""
+"""Descents from several starts, weighted by their likelihoods."""
 
 from __future__ import annotations
 
@@ -22,22 +22,22 @@ from diffcloud.estimation.parameters import FitSpace
 from diffcloud.estimation.residuals import Axis
 
 _START = math.log(4.5)
-"""Between starts, in the logarithm of the stretching."""
+"""Distance between starts, in the logarithm of the first variable (usually stretching)."""
 _REGRIP = 0.3
-"""From there on, it is simulated with the size that the first start has found."""
+"""The fit continues with a new grasp size if the first start changes it by more standard deviations than this."""
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """A fit of one or several recordings."""
+    """Result of a fit of one or several recordings."""
 
     space: FitSpace
     answers: tuple[Answer, ...]
-    """Of all starts that were followed to their end, the likeliest first."""
+    """Results of all completed starts, the most likely first."""
     members: tuple[Objective, ...]
-    """The recordings up to their horizons, with the grasp that was found."""
+    """Objectives up to their horizons, with the estimated grasp size."""
     grip: float | None
-    """Of these, in deviations from the size that was given; None: it is known."""
+    """Estimated grasp size, in standard deviations from the stated size; None if the size is known."""
     simulations: int
     interrupted: bool = False
 
@@ -47,19 +47,19 @@ class Estimate:
 
     @property
     def weights(self) -> NDArray[np.float64]:
-        """[A] of the answers, by their likelihoods."""
+        """[A] weights of the results by their likelihoods."""
         energies = np.array([one.energy for one in self.answers])
         found = np.exp(-0.5 * (energies - energies.min()))
         return np.asarray(found / found.sum())
 
     @property
     def mean(self) -> Tensor:
-        """[K] of the mixture of all answers."""
+        """[K] weighted mean of all results."""
         return torch.from_numpy(self.weights) @ torch.stack([one.place for one in self.answers])
 
     @property
     def sources(self) -> dict[str, Tensor]:
-        """Source -> its part of the mixture's covariance [K, K]; `starts` is what the answers differ by."""
+        """Source of uncertainty -> contribution to the covariance [K, K]. `starts` is the spread between results."""
         apart, mean = torch.zeros_like(self.best.covariance), self.mean
         found = {name: torch.zeros_like(apart) for name in self.best.sources}
         for weight, one in zip(self.weights.tolist(), self.answers, strict=True):
@@ -70,12 +70,12 @@ class Estimate:
 
     @property
     def covariance(self) -> Tensor:
-        """[K, K] of the mixture."""
+        """[K, K] covariance of the mixture."""
         return torch.stack([*self.sources.values()]).sum(0)
 
     @property
     def values(self) -> dict[str, float]:
-        """Of the likeliest answer."""
+        """Parameter values of the most likely result."""
         axis = Axis.of(self.space)
         return dict(zip(self.space.names, axis.bounded(self.best.place[: len(self.space.names)]).tolist(), strict=True))
 
@@ -88,17 +88,18 @@ def estimate(
     *,
     progress: Callable[[int, int, float, dict[str, float]], None] | None = None,
 ) -> Estimate:
-    """The parameters that recordings show, by the rules of `estimation.likelihood`. Ctrl-C ends the fit and keeps the best
-    so far.
+    """Estimate parameters and their uncertainty as `estimation.likelihood` describes.
+
+    Ctrl-C ends the fit and keeps the best result so far.
 
     Args:
-        objective: of the recordings, with the frames that may count.
+        objective: objective of the recordings, with all usable frames.
         space: variables and their priors.
-        progress: takes the number of the start, the step, the mean squared distance and the values.
+        progress: callback. Its arguments are number of the start, step, mean squared distance and values.
 
     Raises:
         DivergedError: the motion diverges from every start.
-        KeyboardInterrupt: before the first place was compared.
+        KeyboardInterrupt: Ctrl-C before the first iterate was evaluated.
     """
     likelihood = up_to_horizon(objective.members, space, settings)
     answers, failures, descent = list[Answer](), list[DivergedError](), None

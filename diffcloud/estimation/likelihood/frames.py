@@ -1,4 +1,4 @@
-"""What one recording says at one place, frame by frame."""
+"""Terms of Φ for one recording, frame by frame."""
 
 from __future__ import annotations
 
@@ -14,31 +14,31 @@ TINY = 1e-12
 
 @dataclass(frozen=True)
 class Frames:
-    """What one recording says at one place: L frames, forth and back, k variables of the motion and d of the pose."""
+    """Terms of Φ for one recording with L frames, two directions, k motion variables and d pose variables."""
 
     squares: Tensor
     """[2, L] mean squared distances."""
     slopes: Tensor
-    """[2, L, k + d] half of their slopes."""
+    """[2, L, k + d] half their gradients."""
     curvatures: Tensor
-    """[2, L, k + d, k + d] half of their Gauss–Newton matrices."""
+    """[2, L, k + d, k + d] half their Gauss–Newton matrices."""
     shifted: Tensor
-    """[2, L, k + d] by which half of the slopes change if the nodes move by the requested shifts."""
+    """[2, L, k + d] change of half the gradients if the nodes move by the given shifts."""
     variances: Tensor
-    """[2, L] that are known."""
+    """[2, L] known variances."""
 
     @property
     def chi_squares(self) -> Tensor:
-        """[L] mean squares over known variances, c."""
+        """[L] mean squared distance divided by the known variance, c, averaged over both directions."""
         return (self.squares / self.variances).mean(0)
 
     @property
     def weights(self) -> Tensor:
-        """[2, L] slope of Φ by the mean squares, for one independent residual."""
+        """[2, L] derivative of Φ with respect to the mean squared distances, for one independent residual."""
         return 0.5 / (self.variances * self.chi_squares.clamp(min=1.0))
 
     def energy(self) -> float:
-        """Φ for one independent residual a frame, but for a constant."""
+        """Return Φ for one independent residual per frame, up to a constant."""
         c = self.chi_squares
         return float((self.variances.log().mean(0) + torch.where(c < 1, c, 1 + c.clamp(min=1e-9).log())).sum())
 
@@ -46,12 +46,13 @@ class Frames:
 def one_way(
     pairs: Pairs, away: Tensor, normals: Tensor, moves: Tensor, moved: Tensor | None, cap: float
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """One way's parts of `Frames`, the curvature as `estimation.matching` has it.
+    """Return the terms of `Frames` for one direction. `estimation.matching` explains the curvature.
 
     Args:
-        away: [1, L, N, 3] from the recorded points to the simulated ones; likewise the surfaces' normals.
-        moves: [K, 1, L, N, 3] of the simulated points by the variables.
-        moved: [1, L, N, 3] of them, whose effect on the slopes is wanted.
+        away: [1, L, N, 3] displacements from recorded to simulated points.
+        normals: [1, L, N, 3] surface normals.
+        moves: [K, 1, L, N, 3] derivatives of the simulated points with respect to the variables.
+        moved: [1, L, N, 3] shifts of the simulated points whose effect on the gradients is needed.
     """
     across = (away * normals).sum(-1, keepdim=True) * normals
     along = away - across
@@ -71,5 +72,5 @@ def one_way(
 
 
 def squared(shift: Tensor) -> Tensor:
-    """[L] mean over nodes of a displacement [1, L, N, 3]."""
+    """Return the mean squared node displacement [L] of displacements [1, L, N, 3]."""
     return shift[0].square().sum(-1).mean(-1)

@@ -1,4 +1,4 @@
-"""Scenarios whose grasp has another size, and what that changes."""
+"""Scenarios with another grasp size, and their effect on the motion."""
 
 from __future__ import annotations
 
@@ -14,11 +14,9 @@ from diffcloud.scene.scenarios import Scenario
 
 
 def regripped(scenario: Scenario) -> list[Scenario]:
-    """Return variants of a scenario whose grasp is one standard deviation smaller and, if possible, one larger.
-
-    The larger grasp is left out unless its pad fits on the cloth and holds the same nodes. The list is empty if the size
-    of the grasp is known, or if the smaller pad does not fit on the mesh.
-    """
+    """Return variants of a scenario with a grasp one standard deviation smaller and, if possible, one larger. The
+    larger grasp is omitted unless its pad fits on the cloth and holds the same nodes. The list is empty if the grasp
+    size is known, or if the smaller pad does not fit on the mesh."""
     if scenario.regrip is None:
         return []
     found = list[Scenario]()
@@ -31,11 +29,11 @@ def regripped(scenario: Scenario) -> list[Scenario]:
 
 
 def in_powers(grips: Sequence[Tensor | None]) -> tuple[Tensor, Tensor] | None:
-    """Return the (linear, quadratic) coefficients of the change that the size of the grasp causes; None if not known.
+    """Return (linear, quadratic) coefficients of the node displacements as a function of grasp size; None if unknown.
 
     Args:
-        grips: changes of the nodes by a grasp one standard deviation smaller and, if there is one, one larger. None stands
-            for a variant that diverged.
+        grips: node displacements for a grasp one standard deviation smaller and, if available, one larger. None:
+            diverged.
     """
     known = [one for one in grips if one is not None]
     if not grips or len(known) < len(grips):
@@ -52,13 +50,8 @@ def gripped(members: Sequence[Objective], grip: float) -> Sequence[Objective]:
 
 
 def that_fits(members: Sequence[Objective], grip: float) -> float:
-    """Return the largest part of a change in grasp size with which the gripper pad fits on the cloth and the mesh.
-
-    The parts are 1, 3/4, 1/2, 1/4 and, if none of these fits, 0.
-
-    Args:
-        grip: the change, in standard deviations.
-    """
+    """Return the largest fraction of a change in grasp size for which the gripper pad fits on the cloth and the mesh.
+    The fractions are 1, 3/4, 1/2 and 1/4. If none fits, the result is 0."""
     for part in (1.0, 0.75, 0.5, 0.25):
         try:
             for one in members:

@@ -1,4 +1,4 @@
-"""One recording: its motion at a place, and how that changes."""
+"""One recording of a likelihood fit: its motion at one parameter set, and the derivatives."""
 
 from __future__ import annotations
 
@@ -16,25 +16,27 @@ from diffcloud.estimation.residuals import Axis, moved_by
 from diffcloud.scene.scenarios import Scenario
 
 INDEPENDENT = 10.0
-"""Residuals of a frame that count as independent, of frames a tenth of a second apart."""
+"""Assumed number of independent residuals per frame, for frames 0.1 s apart."""
 _FRAME_S = 0.1
-"""Frames that are closer share these."""
+"""Frames with a smaller distance in time [s] have proportionally fewer independent residuals."""
 _MODEL_M = 0.001
-"""What no simulator of cloth predicts better."""
+"""Minimum model error [m] of any cloth simulator."""
 
 
 class Recording:
-    """One recording up to its horizon, on the given mesh and the finer one."""
+    """One recording up to its horizon, on the given mesh and the refined one."""
 
     def __init__(
         self, objective: Objective, space: FitSpace, columns: Tensor, first_pose: int, grip: int, *, model_error: bool
     ) -> None:
-        """
+        """Set up the variables of one recording.
+
         Args:
-            space: of this recording, and the places of its variables among all.
-            first_pose: place of the first variable of its pose.
-            grip: place of the grasp's size.
-            model_error: as of `LikelihoodSettings`.
+            space: variables of this recording.
+            columns: indices of these variables in the joint fit.
+            first_pose: index of the first pose variable of this recording.
+            grip: index of the grasp size.
+            model_error: see `LikelihoodSettings`.
         """
         self.objective, self.space, self.axis = objective, space, Axis.of(space)
         poses = len(objective.pose_space.names)
@@ -56,31 +58,31 @@ class Recording:
         return self.space.parameters(self.axis.bounded(place[None, self.motion]))
 
     def nodes(self, place: Tensor) -> Tensor:
-        """[1, L, C · V, 3] of the cloth in the scene."""
+        """Return the cloth nodes [1, L, C · V, 3] in the scene."""
         return self.objective.looked_at(self.objective.simulate_to_loss(self.parameters(place)))
 
     @cached_property
     def finer(self) -> Scenario:
-        """On the finer mesh."""
+        """The scenario with the refined mesh."""
         return self.objective.scenario.finer()
 
     def change(self, place: Tensor, nodes: Tensor, variant: Scenario) -> Tensor:
-        """[1, L, C · V, 3] by which a variant of the scenario moves the nodes."""
+        """Return the node displacements [1, L, C · V, 3] that a scenario variant causes."""
         return self.objective.way_to(variant, self.parameters(place), nodes)
 
 
 @dataclass(frozen=True)
 class Changes:
-    """By how much variants of one scenario move the nodes, [1, L, C · V, 3] each; None: not known."""
+    """Node displacements [1, L, C · V, 3] that variants of one scenario cause; None: unknown."""
 
     finer: Tensor | None = None
     grip: tuple[Tensor, Tensor] | None = None
-    """By a grasp g standard deviations larger, in powers of g: the first and the second one."""
+    """Linear and quadratic coefficient for a grasp that is g standard deviations larger."""
 
 
 @dataclass(frozen=True)
 class Linear:
-    """The motion of one recording at a place, and how it changes."""
+    """Motion of one recording at one parameter set, with its derivatives."""
 
     recording: Recording
     nodes: Tensor
@@ -97,9 +99,10 @@ class Linear:
         return Linear(recording, objective.looked_at(moved.run), moved.rates, velocities)
 
     def frames(self, place: Tensor, changes: Changes, asked: Tensor | None = None) -> Frames:
-        """
+        """Return the terms of Φ.
+
         Args:
-            asked: [1, L, C · V, 3] of the nodes, whose effect on the slopes is wanted.
+            asked: [1, L, C · V, 3] node shifts whose effect on the gradients is needed.
         """
         one = self.recording
         objective, space = one.objective, one.objective.pose_space

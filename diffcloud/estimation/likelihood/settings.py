@@ -1,4 +1,4 @@
-"""Settings of a fit by its likelihood."""
+"""Settings of a maximum-likelihood fit."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ class LikelihoodSettings:
     max_steps: int = 12
     """Maximum number of iterates per start, the first one included."""
     starts: int = 3
-    """Number of starts. The first is at the centres of the priors; the others shift the first variable, the stretching, up
-    and down."""
+    """Number of starts. The first is at the centres of the priors. The others shift the first variable (usually
+    stretching) up and down."""
     seed: int = 0
     """Seed of the sampled points."""
     model_error: bool = True

@@ -1,7 +1,7 @@
-"""Solvers: from an objective and a space of bounded variables to the best place found. One file each.
+"""Solvers: minimise an objective over bounded variables. Each solver has its own file.
 
-`likelihood` finds the likeliest parameters and their uncertainty. `adam` descends along the gradient of the loss, as in the
-paper; `cma_es` and `random_search` are searches, which ask for losses alone.
+`likelihood` estimates parameters and their uncertainty. `adam` descends along the gradient of the loss, as in the
+paper. `cma_es` and `random_search` are searches without derivatives.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ SOLVERS: Mapping[str, type[Settings]] = {
     "cma_es": CmaEsSettings,
     "random_search": RandomSearchSettings,
 }
-"""Name -> type of the settings."""
+"""Name of a solver -> type of its settings."""
 SOLVER_NAMES: Mapping[type[Settings], str] = {kind: name for name, kind in SOLVERS.items()}
-"""Type of the settings -> name."""
+"""Type of the settings -> name of the solver."""
 
 __all__ = [
     "SOLVERS",
@@ -58,11 +58,13 @@ def solve(
     *,
     progress: Callable[[Progress], None] | None = None,
 ) -> FitOutcome:
-    """Minimise by the solver whose settings these are. Ctrl-C ends the fit and keeps the best so far.
+    """Minimise with the solver to which the settings belong.
+
+    Ctrl-C ends the fit and keeps the best result so far.
 
     Raises:
         DivergedError: every start, or every candidate of a search, diverged.
-        KeyboardInterrupt: interrupted before the first loss.
+        KeyboardInterrupt: Ctrl-C before the first loss.
     """
     match settings:
         case LikelihoodSettings():

@@ -1,4 +1,4 @@
-"""Adam with the paper's settings, over several starts at once (paper, sections III-C and IV)."""
+"""Adam with the paper's settings, from several starts at once (paper, sections III-C and IV)."""
 
 from __future__ import annotations
 
@@ -17,32 +17,31 @@ from diffcloud.estimation.parameters import FitSpace
 from diffcloud.estimation.solvers.outcome import FitHistory, FitOutcome, Progress, StopReason
 
 _COPIES = 8
-"""Perturbed ones of the first start, in antithetic pairs; even."""
+"""Number of perturbed copies of the first start. They are antithetic pairs, so it is even."""
 
 
 @dataclass(frozen=True)
 class AdamSettings:
-    """Of one fit."""
+    """Settings of one fit with Adam."""
 
     learning_rate: float = 0.2
     max_steps: int = 50
     threshold: float = 0.0
-    """Stop below this loss; 0: never."""
+    """Loss below which the descent stops; 0: never."""
     starts: int = 1
     seed: int = 0
     resample: bool = False
-    """Draw new points in each iteration (the published scripts do) instead of common random numbers."""
+    """Sample new points in each iteration, as the published scripts do, instead of using the same ones."""
     smoothing: float = 0.0
-    """Standard deviation of perturbed copies of the first start on the unbounded axis; 0: none.
+    """Standard deviation of the perturbed copies of the first start, in unbounded variables; 0: no copies.
 
-    After contact the loss is rough, and its exact derivative is right in the small and often useless in the large. The
-    mean gradient over a few perturbed copies estimates the slope of the smoothed loss (randomised smoothing; Suh et al.
-    2022, "Do differentiable simulators give better policy gradients?"). The copies are simulated as one batch, and they
-    are iterates like any other: each is a parameter set whose loss has been measured. Further starts go without: they
-    search widely by their number.
+    After contact the loss is non-smooth, and its exact gradient is often useless over finite distances. The mean
+    gradient of several perturbed copies estimates the gradient of a smoothed loss (randomised smoothing; Suh et al.
+    2022, "Do differentiable simulators give better policy gradients?"). The copies are simulated as one batch. Each is
+    also a candidate for the result. Other starts have no copies.
     """
     init: Mapping[str, float] = field(default_factory=dict)
-    """Values of the first start; the middle of the range where not given."""
+    """Values of the first start; by default the centre of the range."""
 
 
 def fit_adam(
@@ -52,13 +51,14 @@ def fit_adam(
     *,
     progress: Callable[[Progress], None] | None = None,
 ) -> FitOutcome:
-    """Minimise; the lowest-loss iterate wins. Ctrl-C ends the fit and keeps the best so far.
+    """Minimise the loss and return the iterate with the lowest one.
 
-    A start that diverges is dropped and reported; the others go on.
+    A start that diverges is dropped and reported; the others continue. Ctrl-C ends the fit and keeps the best result so
+    far.
 
     Raises:
         DivergedError: every start diverged.
-        KeyboardInterrupt: interrupted before the first loss.
+        KeyboardInterrupt: Ctrl-C before the first loss.
     """
     began = time.perf_counter()
     start_values, logarithmic = space.starts(settings.starts, seed=settings.seed, first=settings.init)
@@ -90,7 +90,7 @@ def fit_adam(
                     lost = torch.zeros(len(owner), dtype=torch.bool)
                     lost[error.entries] = True
                     for entry in (lost & (noise == 0).all(-1)).nonzero().flatten().tolist():
-                        alive[owner[entry]] = False  # the start itself; a lost copy costs only this iteration's share
+                        alive[owner[entry]] = False  # the start itself; a diverged copy is only skipped in this iteration
                         failures.append(f"start {int(owner[entry])} {_describe(space, values[entry])}: {error}")
                     if not bool(alive.any()):
                         described = _describe(space, values[error.entries[0]])
@@ -122,7 +122,7 @@ def fit_adam(
             raise
         reason = "interrupted"
     if settings.resample:
-        objective.reseed(settings.seed)  # the record states this seed: what follows must compare the same points
+        objective.reseed(settings.seed)  # the record states this seed, so later evaluations must use these points
     return FitOutcome(
         values=dict(zip(space.names, best.values.tolist(), strict=True)),
         loss=best.loss,
@@ -140,11 +140,11 @@ class _Best:
     loss: float
     start: int
     values: Tensor
-    """[k]"""
+    """[k] values of the best iterate."""
 
 
 def _trials(settings: AdamSettings, unbounded: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-    """What is simulated in one iteration: the start that each trial belongs to [E], and its perturbation [E, k]."""
+    """Return the start [E] to which each simulation of one iteration belongs, and its perturbation [E, k]."""
     starts, variables = unbounded.shape
     half = settings.smoothing * torch.randn(_COPIES // 2, variables, generator=generator)
     copies = torch.cat([half, -half]) if settings.smoothing else half[:0]

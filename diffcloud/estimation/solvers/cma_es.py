@@ -1,5 +1,5 @@
-"""CMA-ES: a normal distribution of candidates that moves, widens and turns with the better ones (Hansen 2016, "The CMA
-evolution strategy: a tutorial"), on the axis of `residuals.Axis`."""
+"""CMA-ES, an evolution strategy with an adapted normal distribution of candidates, in fit coordinates
+(`residuals.Axis`). Source: Hansen 2016, "The CMA evolution strategy: a tutorial"."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ from diffcloud.estimation.solvers.outcome import FitOutcome, Progress
 from diffcloud.estimation.solvers.search import SearchSettings, search
 
 _SPREAD = 0.3
-"""First standard deviation as a part of each range, which its authors advise: 0.2 to 0.5."""
+"""Initial standard deviation as a fraction of each range; Hansen recommends 0.2 to 0.5."""
 _EDGE = 1e-9
-"""Part of a range by which the first mean stays off a bound."""
+"""Minimum distance of the initial mean from a bound, as a fraction of the range."""
 _DIVERGED = 1e300
-"""Loss of a diverged candidate: worse than all others, and a number; CMA-ES only ranks."""
+"""Loss of a diverged candidate. It must be finite and larger than all others, since CMA-ES only ranks losses."""
 
 
 @dataclass(frozen=True)
 class CmaEsSettings(SearchSettings):
-    """Of one search by CMA-ES."""
+    """Settings of one search with CMA-ES."""
 
 
 def fit_cma_es(
@@ -34,19 +34,19 @@ def fit_cma_es(
     *,
     progress: Callable[[Progress], None] | None = None,
 ) -> FitOutcome:
-    """Minimise from the first parameter set, a generation at a time; the lowest candidate wins.
+    """Minimise from the first parameter set, one generation at a time, and return the best candidate.
 
-    Ctrl-C ends the fit and keeps the best so far.
+    Ctrl-C ends the fit and keeps the best result so far.
 
     Raises:
         DivergedError: every candidate diverged.
-        KeyboardInterrupt: interrupted before the first loss.
+        KeyboardInterrupt: Ctrl-C before the first loss.
     """
     return search(objective, space, settings, lambda first: _Generations(first, settings.seed), progress=progress)
 
 
 class _Generations:
-    """The candidates of the package `cma`, with random numbers of their own: its default are numpy's global ones."""
+    """Candidates from the package `cma`, with their own random generator instead of numpy's global one."""
 
     def __init__(self, first: NDArray[np.float64], seed: int) -> None:
         from cma import CMAEvolutionStrategy  # takes a second to import
@@ -54,7 +54,7 @@ class _Generations:
         self._variables = len(first)
         mean = np.clip(first, _EDGE, 1 - _EDGE)
         if len(mean) < 2:
-            # the covariance of one variable adapts nothing, and the package refuses it: a second one that changes nothing
+            # the package does not accept a single variable, so add a second one without effect
             mean = np.append(mean, 0.5)
         generator = np.random.default_rng(seed)
         options = {
@@ -77,5 +77,5 @@ class _Generations:
 
     def tell(self, losses: NDArray[np.float64]) -> None:
         if not np.isfinite(losses).any():
-            return  # they rank nothing, and equal losses would be taken for the end: drawn anew
+            return  # equal losses would look like convergence; sample again instead
         self._strategy.tell(self._asked, np.nan_to_num(losses, posinf=_DIVERGED).tolist())

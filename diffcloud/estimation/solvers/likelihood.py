@@ -1,4 +1,4 @@
-"""`estimation.likelihood` as a solver."""
+"""The solver `likelihood`, which wraps `estimation.likelihood`."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ def fit_likelihood(
     *,
     progress: Callable[[Progress], None] | None = None,
 ) -> FitOutcome:
-    """`estimate` as a solver: the likeliest answer, whose losses are mean squared distances.
+    """Run `estimate` and return its most likely result. The losses in the history are mean squared distances.
 
     Raises:
-        DivergedError, KeyboardInterrupt: as of `estimate`.
+        DivergedError, KeyboardInterrupt: see `estimate`.
     """
     began, best = time.perf_counter(), math.inf
 

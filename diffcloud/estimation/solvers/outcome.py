@@ -1,4 +1,4 @@
-"""What every solver hands out: progress while it works, and what it found."""
+"""Progress and result types that all solvers share."""
 
 from __future__ import annotations
 
@@ -13,50 +13,50 @@ if TYPE_CHECKING:
     from diffcloud.estimation.likelihood import Estimate
 
 StopReason = Literal["converged", "iterations", "simulations", "threshold", "interrupted"]
-"""`converged`: the best start has arrived, or the candidates of a search lie together. `threshold`: low enough.
-`iterations`, or `simulations` of a search: none of them yet."""
+"""`converged`: the best start converged, or the candidates of a search are close together. `threshold`: the loss is
+below the threshold. `iterations` or `simulations`: the limit was reached first. `interrupted`: Ctrl-C."""
 
 
 @dataclass(frozen=True)
 class Progress:
-    """What a progress display gets after each iteration, which is a batch of a search."""
+    """Progress after one iteration, or after one batch of a search."""
 
     iteration: int
     loss: float
     best: float
     values: Mapping[str, float]
-    """Of the best so far."""
+    """Values of the best iterate so far."""
     simulations: int | None = None
-    """Simulations so far, which count towards the budget of a search; None for other solvers."""
+    """Number of simulations so far, which the budget of a search limits; None for other solvers."""
 
 
 @dataclass
 class FitHistory:
-    """Losses, values and gradients of N iterations, B starts and k variables. A search has B = 1, its best so far."""
+    """Losses, values and gradients of N iterations, B starts and k variables. A search has B = 1, the best so far."""
 
     names: tuple[str, ...]
     losses: list[Tensor] = field(default_factory=list)
-    """N of [B], unperturbed; infinite for a start that has diverged."""
+    """N tensors [B], without perturbation; infinite for a diverged start."""
     values: list[Tensor] = field(default_factory=list)
-    """N of [B, k]"""
+    """N tensors [B, k]."""
     gradients: list[Tensor] = field(default_factory=list)
-    """N of [B, k], by the unbounded variables; none of a search."""
+    """N tensors [B, k], with respect to the unbounded variables; empty for a search."""
 
 
 @dataclass(frozen=True)
 class FitOutcome:
-    """The best iterate of all starts."""
+    """Result of a solver: the best iterate of all starts."""
 
     values: dict[str, float]
     loss: float
     best_start: int
     simulations: int
-    """Simulations run, with their gradients but for searches."""
+    """Number of simulations, including gradients (searches have none)."""
     stop_reason: StopReason
     seconds: float
     history: FitHistory
     failures: tuple[str, ...] = ()
-    """Messages of starts that diverged."""
+    """Messages of diverged starts."""
     estimate: Estimate | None = None
     """The estimate with its uncertainty; None unless the solver is `likelihood`."""
 
@@ -72,7 +72,7 @@ class FitOutcome:
 
     @property
     def iterations(self) -> int:
-        """Updates done, or batches of a search after the first."""
+        """Number of updates, or of batches after the first in a search."""
         return len(self.history.losses) - 1
 
     @property

@@ -14,7 +14,7 @@ from diffcloud.estimation.solvers.outcome import FitOutcome, Progress
 from diffcloud.estimation.solvers.search import SearchSettings, search
 
 _BATCH = 16
-"""Draws simulated together: enough for the threads of a common machine, few enough to stop soon below a threshold."""
+"""Samples per batch: enough for the cores of a typical machine, and few enough to stop soon below a threshold."""
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,7 @@
-"""What searches have in common: they ask for losses alone, within a budget of simulations.
+"""Common part of searches without derivatives, which have a budget of simulations.
 
-A search proposes places in the unit box, whose sides are the ranges on the axis of `residuals.Axis`: logarithmic where the
-lower bound is positive. The first place is given. What diverges has an infinite loss; the lowest loss wins.
+A search proposes points in the unit box. It is mapped to the bounds in fit coordinates (`residuals.Axis`), which are
+logarithmic if the lower bound is positive. The first point is given. Diverged simulations have infinite loss.
 """
 
 from __future__ import annotations
@@ -27,20 +27,20 @@ from diffcloud.estimation.solvers.outcome import FitHistory, FitOutcome, Progres
 
 @dataclass(frozen=True)
 class SearchSettings:
-    """Of one search.
+    """Settings of one search.
 
     Raises:
-        ConfigError: fewer than one simulation.
+        ConfigError: the budget is less than one simulation.
     """
 
     max_simulations: int = 200
-    """Runs at most; a parameter set takes one for each recording."""
+    """Maximum number of simulations. A parameter set needs one per recording."""
     threshold: float = 0.0
-    """Stop below this loss; 0: never."""
+    """Loss below which the search stops; 0: never."""
     seed: int = 0
-    """Of what is drawn."""
+    """Seed of the samples."""
     init: Mapping[str, float] = field(default_factory=dict)
-    """Values of the first parameter set; the middle of the range where not given."""
+    """Values of the first parameter set; by default the centre of the range."""
 
     def __post_init__(self) -> None:
         if self.max_simulations < 1:
@@ -48,17 +48,17 @@ class SearchSettings:
 
 
 class Proposals(Protocol):
-    """Where a search looks next."""
+    """Interface of a search strategy."""
 
     @property
     def converged(self) -> bool:
-        """Whether more would not be lower."""
+        """Whether further candidates are not expected to be better."""
 
     def ask(self) -> NDArray[np.float64]:
-        """[b, k] places in the unit box, simulated as one batch."""
+        """Return the next candidates [b, k] in the unit box, which are simulated as one batch."""
 
     def tell(self, losses: NDArray[np.float64]) -> None:
-        """Losses [b] of the places that `ask` gave last; infinite where the simulation diverged."""
+        """Receive the losses [b] of the last candidates; infinite if a simulation diverged."""
 
 
 def search(
@@ -69,16 +69,16 @@ def search(
     *,
     progress: Callable[[Progress], None] | None = None,
 ) -> FitOutcome:
-    """Try what is proposed until the budget is spent. Ctrl-C ends the search and keeps the best so far.
+    """Evaluate candidates until the budget is used. Ctrl-C ends the search and keeps the best so far.
 
-    The history has one column: the lowest so far, after each batch from the first that brought a loss.
+    The history has one column, the lowest loss after each batch. It begins with the first finite loss.
 
     Args:
-        propose: takes the first place [k] in the unit box.
+        propose: function that creates the search strategy from the first point [k] in the unit box.
 
     Raises:
         DivergedError: every parameter set diverged.
-        KeyboardInterrupt: interrupted before the first loss.
+        KeyboardInterrupt: Ctrl-C before the first loss.
     """
     began = time.perf_counter()
     axis = Axis.of(space)
@@ -140,4 +140,4 @@ def search(
 class _Best:
     loss: float
     values: Tensor
-    """[k]"""
+    """[k] values of the best candidate."""

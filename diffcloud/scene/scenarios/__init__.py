@@ -1,9 +1,9 @@
-"""Scenarios: a scene and how an experiment looks at it (which frame, which faces, which bounds).
+"""Scenarios: a scene with the settings of an experiment, such as compared frames, sampled faces and bounds.
 
-The built-ins are procedural and in SI: `lift`, `fold`, `shake` (grid), `band_stretch` (band), `vest_hang` (vest), and, for
-the published recordings under their gripper's track, `recorded_lift` and `recorded_fold` (grid). The `release_*` scenarios
-carry the settings of the experiments published with the paper and take their scene from the published JSON. A
-person's own scenario is a YAML file that starts from a built-in and changes what differs.
+The built-in ones are procedural and in SI units: `lift`, `fold`, `shake` (grid), `band_stretch` (band) and `vest_hang`
+(vest). `recorded_lift` and `recorded_fold` (grid) belong to the published recordings with their gripper tracks. The
+`release_*` scenarios have the settings of the experiments published with the paper and read the published scene JSON. A
+user's scenario is a YAML file that names a built-in one and the fields that differ.
 """
 
 from diffcloud.io.published import PAPER_THRESHOLD, RELEASE_UNIT_M

@@ -1,4 +1,4 @@
-"""An elastic band that hangs on a level pole and is pulled away from it: the built-in `band_stretch`."""
+"""The built-in `band_stretch`: an elastic band that hangs on a level pole and is pulled away from it."""
 
 from __future__ import annotations
 
@@ -19,10 +19,8 @@ from diffcloud.scene.scenarios.sheet import Sheet
 
 
 class BandScenario(ScenarioOptions):
-    """An elastic band that runs without slack around a level pole and a gripper in front of the pole (at -y).
-
-    The band lies like a belt around two level pulleys: one strand above the other. A YAML file may set every field.
-    """
+    """An elastic band without slack around a level pole and a gripper in front of the pole (at -y). The band runs like
+    a belt around two level pulleys, with one strand above the other. A YAML file may set every field."""
 
     material: str | Sheet = "soft-foam"
     contact_thickness_m: Length = 0.008
@@ -30,20 +28,20 @@ class BandScenario(ScenarioOptions):
     circumference_m: Length = 1.75
     width_m: Length = 0.12
     nodes: tuple[Annotated[int, Field(ge=4, le=500)], Annotated[int, Field(ge=2, le=500)]] = (32, 2)
-    """Node counts along the band and across it."""
+    """Number of nodes along the band and across it."""
     center_m: tuple[Coordinate, Coordinate, Coordinate] = (0.0, 0.0, 1.0)
-    """The middle of the band at the start."""
+    """Centre of the band at the start."""
     pole: Literal["square", "round"] = "round"
     pole_width_m: Length = 0.08
-    """Side of the square, or diameter."""
+    """Side of the square pole, or diameter of the round one."""
     pole_length_m: Length = 0.4
-    """Along x, the band in its middle."""
+    """Length along x, with the band at its centre."""
     pole_sides: Annotated[int, Field(ge=3, le=1000)] = 24
-    """Of a round pole."""
+    """Number of sides of a round pole's mesh."""
     pole_gap_m: Length = 0.012
-    """Between the band and the pole at the start."""
+    """Gap between band and pole at the start."""
     grasped_columns: Annotated[int, Field(ge=1, le=500)] = 3
-    """Nodes along the band that the gripper holds, over its whole width."""
+    """Number of nodes along the band that the gripper holds, over its whole width."""
 
 
 BAND_STRETCH = BandScenario(
@@ -58,14 +56,14 @@ BAND_STRETCH = BandScenario(
 )
 
 _ON_EDGE = np.array([[0.0, 0.0, -1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]])
-"""Turns a loop that lies level, and its axis z, on edge: the axis to -x, x upwards."""
+"""Rotation of a level loop with axis z onto its edge: the axis to -x, x to +z."""
 
 
 def band_scenario(options: BandScenario) -> Scenario:
-    """The scenario of a band around a pole.
+    """Return the scenario of a band around a pole.
 
     Raises:
-        SceneError: a pole too thick for the band, or more grasped columns than the band has.
+        SceneError: the pole is too thick for the band, or there are more grasped columns than the band has.
     """
     along, across = options.nodes
     if options.grasped_columns >= along:
@@ -93,7 +91,7 @@ def band_scenario(options: BandScenario) -> Scenario:
 
 
 def _pole(options: BandScenario, offset: float) -> SurfaceMesh:
-    """Upright, at y = offset."""
+    """Return the upright pole at y = offset."""
     half, end = options.pole_width_m / 2, options.pole_length_m / 2
     if options.pole == "square":
         return box_surface([-half, offset - half, -end], [half, offset + half, end])

@@ -1,4 +1,4 @@
-"""All scenarios by name, and YAML files that start from a built-in and change what differs."""
+"""All scenarios by name, and YAML files that modify a built-in one."""
 
 from __future__ import annotations
 
@@ -27,15 +27,15 @@ SCENARIO_NAMES = (*_BUILT_IN, *EXPERIMENTS)
 
 
 def load_scenario(name: str | Path | None, scene: Path | None = None) -> Scenario:
-    """A scenario by name or YAML file, or from a scene file, or both.
+    """Load a scenario by name, YAML file or scene file, or an experiment with its scene file.
 
     Args:
-        name: a built-in, a `release_*` experiment (then `scene` is needed), the path of a YAML file, or None for a
-            scene file as it is written.
+        name: a built-in scenario, a `release_*` experiment (which needs `scene`), or the path of a YAML file. None: use
+            the scene file as it is.
         scene: a scene file, such as an ARCSim scene JSON.
 
     Raises:
-        ConfigError, SceneError, MeshError: what is wrong and what is allowed.
+        ConfigError, SceneError, MeshError: the input is invalid; names the allowed values.
     """
     if name is None:
         if scene is None:
@@ -62,10 +62,10 @@ def load_scenario(name: str | Path | None, scene: Path | None = None) -> Scenari
 
 
 def make_scenario(options: Options) -> Scenario:
-    """The scenario of any built-in's options.
+    """Return the scenario of the given options.
 
     Raises:
-        SceneError, MeshError: options that contradict each other.
+        SceneError, MeshError: the options contradict each other.
     """
     match options:
         case GridScenario():
@@ -89,10 +89,10 @@ def built_in(name: Literal["vest_hang"]) -> VestScenario: ...
 @overload
 def built_in(name: str) -> Options: ...
 def built_in(name: str) -> Options:
-    """The options of a built-in scenario, to vary.
+    """Return the options of a built-in scenario.
 
     Raises:
-        ConfigError: no such built-in.
+        ConfigError: the name is unknown.
     """
     if name not in _BUILT_IN:
         raise ConfigError(unknown_name("built-in scenario", name, _BUILT_IN))
@@ -100,10 +100,10 @@ def built_in(name: str) -> Options:
 
 
 def read_options(path: Path) -> Options:
-    """Read a person's own scenario: `base:` with a built-in's name (default `lift`), then the fields that differ.
+    """Read a user's scenario: `base:` with the name of a built-in one (default `lift`), and the fields that differ.
 
     Raises:
-        SceneError: an unreadable file, an unknown field, or a value out of range.
+        SceneError: the file is unreadable, a field is unknown, or a value is out of range.
     """
     data = read_yaml(path, error=SceneError, kind="scenario file")
     if not isinstance(data, dict):
@@ -112,15 +112,15 @@ def read_options(path: Path) -> Options:
 
 
 def own_options(fields: Mapping[str, object], name: str, source: object, *, folder: Path) -> Options:
-    """What `read_options` makes of the fields of a file.
+    """Return the options from the fields of a scenario file.
 
     Args:
-        name: of the scenario.
-        source: of the fields, for messages.
-        folder: from which the path of a material is meant.
+        name: name of the scenario.
+        source: origin of the fields, for messages.
+        folder: folder to which the path of a material is relative.
 
     Raises:
-        SceneError: an unknown field, or a value out of range.
+        SceneError: a field is unknown, or a value is out of range.
     """
     data = dict(fields)
     base = data.pop("base", "lift")

@@ -1,4 +1,4 @@
-"""A rectangular cloth over a table: the built-ins `lift`, `fold` and `shake`, and a person's own cloth."""
+"""A rectangular cloth over a table: the built-in `lift`, `fold` and `shake`, and users' own cloths."""
 
 from __future__ import annotations
 
@@ -23,50 +23,51 @@ from diffcloud.sim.integrators import load_integrator
 from diffcloud.sim.surrounding import ContactSettings
 
 Names = tuple[str | int, ...]
-"""Places: corners (left/right_bottom/top of the unrotated cloth), or indices of nodes of the uniform grid."""
+"""Grasp points: corners (left/right_bottom/top of the unrotated cloth), or node numbers of the uniform grid."""
 
 
 class Gripper(Checked):
-    """One of several."""
+    """One of several grippers."""
 
     grasped: Annotated[Names, Field(min_length=1)]
     path: Keyframes | None = None
-    """Its displacement; without, the scenario's `path`."""
+    """Displacement of this gripper. Default: the scenario's `path`."""
 
 
 class GridScenario(ScenarioOptions):
-    """A rectangular cloth over a table: everything a person may change in a YAML file (SI units)."""
+    """A rectangular cloth over a table. A YAML file may set every field (SI units)."""
 
     size_m: tuple[Length, Length]
-    """Extent along the cloth's own x and y."""
+    """Size along the cloth's own x and y."""
     nodes: tuple[Annotated[int, Field(ge=2, le=500)], Annotated[int, Field(ge=2, le=500)]] = (7, 7)
-    """Node counts along x and y."""
+    """Number of nodes along x and y."""
     center_m: tuple[Coordinate, Coordinate] = (0.0, 0.0)
-    """Where the cloth's centre lies on the table."""
+    """Position of the cloth's centre on the table."""
     yaw_deg: Annotated[float, Field(ge=-360, le=360)] = 45.0
-    """Rotation about the vertical; 45 lays a square cloth as a diamond."""
+    """Rotation about the vertical. With 45, a square cloth is a diamond."""
     table_height_m: Coordinate = 0.0
     gap_m: NonNegative = 0.0006
-    """Height of the cloth's middle surface over the table at the start: where it lies at rest, unless contact carries it
-    higher up, from where it falls. Default: half the thickness of a usual cloth."""
+    """Initial height of the cloth's mid-surface above the table. This is the rest height, unless contact holds the
+    cloth higher; then it falls from there. Default: half the thickness of a usual cloth."""
     grasped: Names = ()
-    """Places where the gripper holds the cloth and moves it; those side by side are one grasp."""
+    """Grasp points that the gripper moves. Adjacent ones form one grasp."""
     grippers: dict[str, Gripper] = Field(default_factory=dict)
-    """Instead of `grasped`, where several grippers move the cloth: name -> what it does."""
+    """Several grippers instead of `grasped`: name -> settings."""
     held: Names = ()
-    """Places where the cloth is held and stays."""
+    """Grasp points that stay fixed."""
     grip: Grip = "pad"
-    """What holds the cloth at each place: a pad that keeps its direction, level or upright (`upright_pad`), or a point that
-    lets it turn (`pivot`)."""
+    """Type of each grasp: a pad with fixed orientation, level (`pad`) or upright (`upright_pad`), or a point that lets
+    the cloth rotate (`pivot`)."""
     grip_m: Length = GRIP_M
-    """Side of the pad, or of the square that a pivot stands for."""
+    """Side of the pad, or of the square that a pivot represents."""
     grip_known_within: Annotated[float, Field(ge=1, le=3)] = 1.0
-    """The factor within which `grip_m` is known, one standard deviation; 1: exactly. Fits by `likelihood` allow for it."""
+    """Standard deviation of `grip_m` as a factor; 1: exact. Fits by `likelihood` take it into account."""
     loss_surface: Literal["all", "grasped_half"] = "all"
     initial_state: Annotated[str, Field(max_length=200)] = "turn=10deg"
-    """Standard deviations of how the cloth may lie otherwise at the start, which fits find: `turn` about its middle,
-    `shape` (height of each of nine waves), `size` of the cloth, and `track` (length of the gripper's path), such as
-    turn=5deg,shape=5mm,size=2%,track=2%; or none. A hand seldom puts a cloth down more exactly than within 10 degrees."""
+    """Standard deviations of the deviations from the initial state, which fits estimate: `turn` about the cloth's
+    centre, `shape` (height of each of nine waves), `size` of the cloth, and `track` (length of the gripper's path).
+    Example: turn=5deg,shape=5mm,size=2%,track=2%; or none. People seldom place a cloth more exactly than within 10
+    degrees."""
 
     @field_validator("initial_state")
     @classmethod
@@ -89,9 +90,9 @@ class GridScenario(ScenarioOptions):
 
 
 _NARROWEST = 0.1
-"""Times the size of a grasp: the least distance of two grid lines."""
+"""Minimum distance of two grid lines, in sizes of a grasp."""
 _SIDE = 0.2625
-"""Side of the cloth of the paper's experiments [m] (0.75 release units)."""
+"""Side of the cloth in the paper's experiments [m] (0.75 release units)."""
 LIFT = GridScenario(
     name="lift",
     size_m=(_SIDE, _SIDE),
@@ -126,10 +127,11 @@ SHAKE = GridScenario(
 
 
 def grid_scenario(options: GridScenario) -> Scenario:
-    """The scenario of a rectangular cloth over a table.
+    """Return the scenario of a rectangular cloth over a table.
 
     Raises:
-        SceneError: a corner or node that does not exist, a pad as large as the cloth, or too few nodes for the pads.
+        SceneError: a corner or node does not exist, a pad is as large as the cloth, or there are too few nodes for the
+            pads.
     """
     named = {name: one.grasped for name, one in options.grippers.items()} or {"gripper": options.grasped}
     places = [_places(options, names) for names in (*named.values(), options.held)]
@@ -173,22 +175,23 @@ def grid_scenario(options: GridScenario) -> Scenario:
 
 @dataclass(frozen=True)
 class _Regrip:
-    """A scenario with another size of its grasp."""
+    """Function that returns the scenario with another grasp size."""
 
     options: GridScenario
 
     def __call__(self, deviations: float) -> Scenario:
-        """
+        """Return the scenario with a grasp this many standard deviations larger.
+
         Raises:
-            SceneError: a pad as large as the cloth.
+            SceneError: the pad is as large as the cloth.
         """
         size = self.options.grip_m * self.options.grip_known_within**deviations
         return grid_scenario(self.options.model_copy(update={"grip_m": size}))
 
 
 def _sunk(options: GridScenario) -> float:
-    """How far contact's table lies below the real one, so that the cloth rests where it starts [m]: contact carries a
-    cloth some 2 mm above its table, and a real cloth's middle surface lies at half its thickness."""
+    """Return how far the contact table is below the real one [m], so that the cloth is initially at rest. The contact
+    model holds a cloth about 2 mm above its table. The mid-surface of a real cloth is at half its thickness."""
     contact = ContactSettings(options.contact_stiffness, options.contact_thickness_m)
     weight = -options.gravity[2] * chosen_material(options).density
     if weight <= 0:
@@ -222,7 +225,7 @@ _Pad = tuple[NDArray[np.float64], NDArray[np.float64]]
 def _pads(
     options: GridScenario, places: Sequence[Sequence[int]]
 ) -> tuple[list[NDArray[np.float64]], list[list[_Pad]] | None]:
-    """Grid lines across and along, and the pads of each gripper; a pivot has none, and uniform lines."""
+    """Return grid lines along x and y, and the pads of each gripper (uniform lines and None for pivots)."""
     uniform = [np.linspace(0, side, count) for side, count in zip(options.size_m, options.nodes, strict=True)]
     if options.grip == "pivot":
         return uniform, None
@@ -251,8 +254,7 @@ def _pads(
 
 
 def _lines(options: GridScenario, axis: int, ends: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Places of the grid lines along an axis: at both sides of the cloth and the ends of pads, and between these as
-    uniform as can be."""
+    """Return the grid lines along an axis: at the cloth's edges and the pads' ends, as uniform as possible between."""
     length, count, name = options.size_m[axis], options.nodes[axis], "xy"[axis]
     breaks = np.unique(np.round([0.0, length, *ends], 9))
     gaps = np.diff(breaks)
@@ -275,7 +277,7 @@ def _lines(options: GridScenario, axis: int, ends: NDArray[np.float64]) -> NDArr
 
 
 def _half(mesh: ClothMesh, grasped: list[int]) -> NDArray[np.int64]:
-    """Faces on the grasped side of the cloth's middle: the part that comes to lie on top."""
+    """Return the faces on the grasped side of the cloth's centre, which end up on top in a fold."""
     side = mesh.nodes[grasped].mean(axis=0) - mesh.nodes.mean(axis=0)
     centre = mesh.nodes[mesh.faces].mean(axis=1) - mesh.nodes.mean(axis=0)
     return np.flatnonzero(centre @ side > 0)

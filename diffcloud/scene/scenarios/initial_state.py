@@ -1,7 +1,4 @@
-"""How the cloth may lie otherwise than the scene has it when a motion begins, as people state it: turn=10deg,shape=5mm.
-
-`estimation.initial_state` has what these variables do, and fits them.
-"""
+"""Parsing of initial-state deviations such as turn=10deg,shape=5mm. `estimation.initial_state` fits them."""
 
 from __future__ import annotations
 
@@ -11,18 +8,18 @@ from diffcloud.errors import ConfigError
 from diffcloud.quantities import parse_deviations
 
 INITIAL_STATE: dict[str, Literal["m", "rad", "1"]] = {"size": "1", "turn": "rad", "shape": "m", "track": "1"}
-"""Name -> unit. `shape` stands for the height of each wave. What recordings share comes first (`estimation.names`), so
-that the variables of each are in the same order in a fit and in its record."""
+"""Variable -> unit. `shape` is the height of each wave. Shared variables come first (`estimation.names`), so that the
+order in a fit and in its record is the same."""
 _LARGEST_SHARE = 0.2
-"""Largest standard deviation of `size` or `track`."""
+"""Maximum standard deviation of `size` or `track`."""
 
 
 def parse_initial_state(text: str) -> dict[str, float]:
-    """What `initial_state` says -> name -> standard deviation of its prior [m, rad, 1], as of `parse_deviations`.
+    """Parse the text of `initial_state` to name -> standard deviation [m, rad, 1].
 
     Raises:
-        ConfigError: an unknown name or unit, a unit of something else, what is no positive number, or a share that is too
-            large; names it.
+        ConfigError: a name or unit is unknown, a unit does not fit the variable, or a number is not positive or too
+            large.
     """
     found = parse_deviations(text, "initial_state", INITIAL_STATE)
     for name, deviation in found.items():

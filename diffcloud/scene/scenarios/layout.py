@@ -1,8 +1,8 @@
-"""Where a recorded cloth lies, found from the recording's first frame: for scenarios that nobody has written by hand.
+"""Estimation of a cloth's layout (pose, size, grasp) from the first frame of a recording without a scenario.
 
-The first frame shows the cloth flat on the table. Its height gives the table's; the rectangle around it, of least area over
-all turns, gives centre, yaw and size; the grasped node is the one under the gripper's first position. Every value comes
-with its reason, and what cannot be so is refused by name before anything is simulated.
+The first frame shows the cloth flat on the table. Its height gives the table height. The rectangle of least area around
+it gives centre, yaw and size. The grasped node is the one below the gripper's first position. Every value has a reason.
+Implausible inputs are rejected before anything is simulated.
 """
 
 from __future__ import annotations
@@ -19,39 +19,39 @@ from diffcloud.scene.scenarios.grid import GridScenario
 from diffcloud.sim.grasp import GRIP_M
 
 _LARGEST_M = 5.0
-"""Of a cloth: a larger cloud is in another unit."""
+"""Maximum size of a cloth; a larger cloud is in another unit."""
 _SMALLEST_M = 0.02
 _LEVEL_DEG = 25.0
-"""Of the first cloud against the horizontal."""
+"""Maximum tilt of the first cloud."""
 _FLAT_M = 0.05
-"""Thickness of the first cloud, over most of its points."""
+"""Maximum thickness of the first cloud, for most of its points."""
 _RIM = 0.005
-"""Part of the points beyond each side: noise, and scraps."""
+"""Fraction of the points that may be outside each side of the rectangle: noise and stray points."""
 _SIZE_OFF = 0.2
-"""Part by which the found size may differ from the stated one: beyond, it is another cloth, or a part of one."""
+"""Maximum relative difference between estimated and stated size. A larger one indicates another cloth."""
 _LEVEL_M = 0.015
-"""Of points above or below the first frame, that may be on the table still."""
+"""Height range around the first frame in which points may still be on the table."""
 _STRETCHED = 1.2
-"""Times its length, as far as a lifted cloth may reach."""
+"""Maximum extension ratio of a lifted cloth."""
 _A_CELL = 8
-"""Points of the first frame in a cell, in which later frames have one if something lies there."""
+"""Number of points per grid cell in the first frame, so that a covered cell has points in later frames too."""
 _FEW_CELLS = 20
-"""That must have left the table, for what stays there to tell a cloth from a table: some come and go by chance."""
+"""Minimum number of cells that must leave the table to separate cloth from table. Fewer may change by chance."""
 _STAYS = 0.5
-"""Part of the area that must have left the table, of which at least so much has really left, if it is a cloth."""
+"""Minimum fraction of the expected lifted area that has really left the table, if the cloud is a cloth."""
 _AT_CORNER_M = 0.03
 _TRAVEL_M = 0.03
 _NODES = (5, 13)
 _GAP_M: float = GridScenario.model_fields["gap_m"].default
-"""Of the cloth over the table at the start."""
+"""Initial height of the cloth above the table."""
 _FEW_POINTS = 100
 FIELDS = ("center_m", "yaw_deg", "initial_state", "table_height_m", "grasped", "rate_hz", "frames", "path")
-"""Of a scenario, those that `find_layout` finds."""
+"""Scenario fields that `find_layout` estimates."""
 
 
 @dataclass(frozen=True)
 class Found:
-    """A value and why it is that."""
+    """A value and the reason for it."""
 
     value: object
     reason: str
@@ -59,34 +59,35 @@ class Found:
 
 @dataclass(frozen=True)
 class Layout:
-    """One recording, as fields of a grid scenario: name -> value and reason."""
+    """Estimated fields of a grid scenario: name -> value and reason."""
 
     fields: dict[str, Found]
     warnings: tuple[str, ...]
 
 
 def found_size(episode: Episode) -> tuple[float, float]:
-    """Sides of the cloth in the first frame, the longer one first [m]."""
+    """Return the sides of the cloth in the first frame, the longer one first [m]."""
     sides = _rectangle(_flat_cloud(episode))[1]
     return max(sides), min(sides)
 
 
 def node_counts(size: tuple[float, float]) -> tuple[int, int]:
-    """Nodes along both sides, 13 along the longer one: the fewest that buckle and fold about as finer ones do."""
+    """Return the numbers of nodes along both sides, 13 along the longer one. Coarser meshes fold differently."""
     columns, rows = (max(round((_NODES[1] - 1) * side / max(size)) + 1, _NODES[0]) for side in size)
     return columns, rows
 
 
 def find_layout(episode: Episode, size: tuple[float, float], pad: float = GRIP_M) -> Layout:
-    """
+    """Estimate the fields of a grid scenario from a recording.
+
     Args:
-        episode: in metres, z up, with the track of one gripper.
-        size: of the cloth [m].
-        pad: side of what the gripper holds the cloth with; 0: a point [m].
+        episode: recording in metres, z up, with the track of one gripper.
+        size: sides of the cloth [m].
+        pad: side of the gripper's pad [m]; 0: a point.
 
     Raises:
-        EpisodeError: no gripper, another unit, a cloud that is not flat and level or that holds the table, a size that is
-            not that of the cloud, or a gripper that is not at the cloth; says what to try.
+        EpisodeError: there is no gripper track, the unit is wrong, the first cloud is not flat and level or contains
+            the table, the stated size does not fit the cloud, or the gripper is not at the cloth. Says what to try.
     """
     if episode.gripper is None:
         raise EpisodeError("The recording has no track of its gripper: put a gripper.csv (t_s, x, y, z) beside the clouds.")
@@ -99,7 +100,7 @@ def find_layout(episode: Episode, size: tuple[float, float], pad: float = GRIP_M
     cloud = _flat_cloud(episode)
     yaw, sides, centre = _rectangle(cloud)
     _refuse_table(episode, cloud, sides)
-    if (sides[0] < sides[1]) != (size[0] < size[1]):  # the longer side is the longer one's
+    if (sides[0] < sides[1]) != (size[0] < size[1]):  # match the longer sides
         yaw, sides = yaw + math.pi / 2, (sides[1], sides[0])
     off = max(abs(side / stated - 1) for side, stated in zip(sides, size, strict=True))
     if off > _SIZE_OFF:
@@ -123,10 +124,10 @@ def find_layout(episode: Episode, size: tuple[float, float], pad: float = GRIP_M
     columns, rows = node_counts(size)
     across, along = np.meshgrid(np.linspace(-half[0], half[0], columns), np.linspace(-half[1], half[1], rows))
     nodes = np.stack([across.ravel(), along.ravel()], axis=-1)
-    # a rectangle looks the same after half a turn: the one that has the grasped corner at its right top is taken
+    # a rectangle is symmetric under half a turn, so choose the yaw with the grasped corner at the top right
     if local[0] < 0 and local[1] < 0:
         yaw, local = yaw + math.pi, -local
-    inner = np.maximum(half - pad / 2, 0.0)  # a pad at a rim lies inside the cloth
+    inner = np.maximum(half - pad / 2, 0.0)  # a pad at an edge is inside the cloth
     distances = np.linalg.norm(np.clip(nodes, -inner, inner) - local, axis=1)
     node = int(distances.argmin())
     if distances[node] > 0.5 * max(size) / (_NODES[1] - 1) + _AT_CORNER_M:
@@ -166,11 +167,13 @@ def find_layout(episode: Episode, size: tuple[float, float], pad: float = GRIP_M
 
 
 def _refuse_table(episode: Episode, cloud: NDArray[np.float64], sides: tuple[float, float]) -> None:
-    """By what still lies on the table where the gripper is highest. A cloth is lifted around the grasped point about as far
-    as the gripper has risen, or it would be stretched; a table stays.
+    """Check that the cloud does not contain the table, by the points that remain low when the gripper is highest.
+
+    A cloth is lifted around the grasped point about as far as the gripper rises; otherwise it would be stretched. Table
+    points remain.
 
     Raises:
-        EpisodeError: more stays than could of a cloth.
+        EpisodeError: more points remain than a cloth could leave.
     """
     assert episode.gripper is not None
     rise = episode.gripper[:, 0, 2] - episode.gripper[0, 0, 2]
@@ -180,7 +183,7 @@ def _refuse_table(episode: Episode, cloud: NDArray[np.float64], sides: tuple[flo
     frame = episode.frame(top)
     lying = frame[np.abs(frame[:, 2] - np.median(cloud[:, 2])) < _LEVEL_M]
     first, stays = (len(np.unique(np.floor(points[:, :2] / cell), axis=0)) for points in (cloud, lying))
-    # a quarter of a disc, as around a corner: from elsewhere, more is lifted
+    # a quarter of a disc, as around a corner; other grasp points lift more
     reach = min(max(float(rise[top]) - _LEVEL_M, 0.0) / _STRETCHED, *sides)
     lifted = math.pi / 4 * reach**2 / area * first
     if lifted >= _FEW_CELLS and first - stays < _STAYS * lifted:
@@ -201,10 +204,10 @@ def _few_points(episode: Episode) -> list[str]:
 
 
 def _flat_cloud(episode: Episode) -> NDArray[np.float64]:
-    """[N, 3] of the first frame, without scraps.
+    """Return the points [N, 3] of the first frame without stray points.
 
     Raises:
-        EpisodeError: too large or too small, not level, or not flat.
+        EpisodeError: the cloud is too large, too small, not level, or not flat.
     """
     cloud = episode.frame(0).astype(np.float64)
     middle = np.median(cloud, axis=0)
@@ -233,7 +236,7 @@ def _flat_cloud(episode: Episode) -> NDArray[np.float64]:
 
 
 def _rectangle(cloud: NDArray[np.float64]) -> tuple[float, tuple[float, float], NDArray[np.float64]]:
-    """Yaw in [0, 90°), sides [m] and centre [2] of the smallest rectangle around a cloud from above."""
+    """Return yaw in [0, 90°), sides [m] and centre [2] of the smallest rectangle around a cloud seen from above."""
     points = cloud[:, :2]
 
     def around(yaw: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -256,6 +259,6 @@ def _rectangle(cloud: NDArray[np.float64]) -> tuple[float, tuple[float, float], 
 
 
 def _turned(yaw: float) -> NDArray[np.float64]:
-    """[2, 2] rows of points times this are in the axes of a cloth at that yaw."""
+    """Return the matrix [2, 2] that transforms row vectors to the axes of a cloth with this yaw."""
     cosine, sine = math.cos(yaw), math.sin(yaw)
     return np.array([[cosine, -sine], [sine, cosine]])

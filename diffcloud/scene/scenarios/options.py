@@ -1,4 +1,4 @@
-"""What every built-in scenario lets a person change, and how it becomes a `Scenario`."""
+"""Options of all built-in scenarios, and their conversion to a `Scenario`."""
 
 from __future__ import annotations
 
@@ -27,62 +27,61 @@ from diffcloud.sim.still_air import AIR_DENSITY, StillAir, still_air
 from diffcloud.sim.surrounding import ContactSettings, Surrounding
 
 Coordinate = Annotated[float, Field(ge=-1000, le=1000)]
-"""[m] Whatever lies farther off is a mistake."""
+"""[m] Larger values are rejected as mistakes."""
 Length = Annotated[float, Field(gt=0, le=100)]
-"""[m] Of a cloth, or of what it meets."""
+"""[m] Size of a cloth or an obstacle."""
 MOST_UNCERTAINTY = 100.0
-"""A larger factor is no knowledge of a material."""
+"""Maximum factor; a larger one says nothing about a material."""
 _Time = Annotated[float, Field(ge=-1e6, le=1e6)]
 Keyframes = Annotated[list[tuple[_Time, Coordinate, Coordinate, Coordinate]], Field(min_length=2)]
 """Keyframes (time s, dx, dy, dz m) of a displacement, in the world's axes."""
 
 
 class ScenarioOptions(Checked):
-    """The fields that all built-in scenarios share (SI units)."""
+    """Fields that all built-in scenarios share (SI units)."""
 
     name: Annotated[str, Field(min_length=1, max_length=200, pattern=r"^[^./\\\s][^/\\]*$")]
-    """Folders and files are named after it. A recording may have any name that one of these can have, and `fit` names
-    its scenario so."""
+    """Name of folders and files. Every name of a recording is allowed, because `fit` uses it for the scenario."""
     material: str | Sheet = "soft-knit"
     """A preset, the path of an ARCSim material JSON, or an isotropic sheet in SI units."""
     compression: Annotated[float, Field(ge=0, le=1)] = 1.0
-    """The part of its stretching stiffness with which the cloth resists compression in its plane. Fabric wrinkles instead,
-    finer than most meshes (docs/physics.md, wrinkles)."""
+    """Fraction of the stretching stiffness that resists in-plane compression. Real fabric forms wrinkles instead, which
+    are finer than most meshes (docs/physics.md, wrinkles)."""
     uncertain: dict[str, Annotated[float, Field(gt=1, le=MOST_UNCERTAINTY)]] = Field(default_factory=dict)
-    """Material that is known less well, or better, than usual: parameter -> factor of one deviation
+    """Material parameters with another uncertainty than the default: parameter -> standard deviation as a factor
     (`estimation.uncertain`)."""
     path: Keyframes
-    """The gripper's displacement."""
+    """Displacement of the gripper."""
     frames: Annotated[int, Field(ge=1, le=100_000)] = 25
     rate_hz: Annotated[float, Field(gt=0, le=1e5)] = 10.0
     steps_per_frame: Annotated[int, Field(ge=1, le=10_000)] = 8
     integrator: IntegratorName = Scene.integrator
-    """"implicit" has steps of second order and smooth contact; "arcsim" are ARCSim's steps, a quarter to a tenth as
-    long to compute and less exact (docs/results/discretisation.md)."""
+    """"implicit" has second-order steps and smooth contact. "arcsim" has ARCSim's steps, which take a quarter to a
+    tenth of the time and are less accurate (docs/results/discretisation.md)."""
     shaped: bool = Scene.shaped
-    """Whether the cloth is at rest in bending as it starts, not flat."""
+    """Whether the initial shape of the cloth has no bending energy, instead of the flat shape."""
     soft_handles: bool = False
     loss_frames: tuple[int, ...] = (-1,)
-    """The frames that the paper's measure compares, and studies of the motion look at."""
+    """Frames for the loss of the paper and for studies of the motion."""
     every_frame: bool = True
-    """Whether fits compare all usable frames; a file that names loss_frames has only those, unless it says true."""
+    """Whether fits compare all usable frames. A file with loss_frames uses only those, unless it sets this to true."""
     points: Annotated[int, Field(ge=1, le=1_000_000)] = 3500
     learning_rate: Annotated[float, Field(gt=0, le=1e3)] = 0.2
     threshold_m2: Annotated[float, Field(ge=0, le=1)] = 0.0
-    """A fit stops when its loss is below; 0: never."""
+    """Loss below which a fit stops; 0: never."""
     recorder: Recorder = "depth_cameras"
     gravity: Vector = Surrounding.gravity
     air: Literal["none", "drag", "still"] = "drag"
-    """"none": a vacuum, as in most simulators; "drag": the pressure on faces that move through the air; "still": also the
-    air that moves along with the cloth, which makes it swing slower, and linear drag (`sim.still_air`)."""
+    """"none": vacuum, as in most simulators. "drag": pressure on faces that move through the air. "still": also linear
+    drag and the air that moves with the cloth, which makes it swing more slowly (`sim.still_air`)."""
     air_density: NonNegative = AIR_DENSITY
-    """Of air that is there [kg/m³]."""
+    """Density of the air, if any [kg/m³]."""
     friction: Friction = Surrounding.friction
     self_friction: Friction = Surrounding.self_friction
     mesh_contact: bool = True
-    """For the arcsim integrator: whether contact is with all meshes and the cloth itself, or with planes only."""
+    """For the arcsim integrator: contact with all meshes and the cloth itself, or with planes only."""
     self_contact: bool = Surrounding.self_contact
-    """Whether the cloth meets itself; without, layers pass through each other, and steps are several times quicker."""
+    """Whether the cloth collides with itself. Without, layers pass through each other, and steps are faster."""
     contact_stiffness: NonNegative = ContactSettings.stiffness
     contact_thickness_m: Annotated[float, Field(gt=0, le=1)] = ContactSettings.repulsion_thickness
 
@@ -101,12 +100,12 @@ class ScenarioOptions(Checked):
 
     @property
     def own_paths(self) -> Mapping[str, Keyframes]:
-        """Gripper -> its path, of those that do not follow `path`."""
+        """Path of each gripper that does not follow `path`."""
         return {}
 
 
 def chosen_material(options: ScenarioOptions) -> Material:
-    """The material that `options.material` names, describes, or has in a file."""
+    """Return the material that `options.material` names or describes."""
     match options.material:
         case Sheet() as sheet:
             return sheet.material(options.name)
@@ -128,18 +127,18 @@ def assemble(
     turned: Mapping[int, tuple[float, float, float]] | None = None,
     loss_faces: NDArray[np.int64] | None = None,
 ) -> Scenario:
-    """The scenario of a cloth and its obstacles in their places.
+    """Build the scenario of a cloth and its obstacles.
 
     Args:
         grippers: name -> nodes that follow its path.
-        held: nodes that stay where they are.
-        grasp: what the nodes stand for; None: nodes.
-        pads: node -> number of the pad that holds it; None: none does.
-        turned: node -> by how much an upright pad displaces it [m].
+        held: nodes that stay fixed.
+        grasp: type and size of the grasp that the nodes represent; None: single nodes.
+        pads: node -> number of the pad that holds it; None: no pads.
+        turned: node -> its displacement by an upright pad [m].
         loss_faces: faces whose surface the loss samples; None for all.
 
     Raises:
-        SceneError: a node that is held twice, or a loss frame after the end.
+        SceneError: a node is held twice, or a loss frame is after the end.
     """
     nodes = [*held, *(node for grasped in grippers.values() for node in grasped)]
     twice = sorted({node for node in nodes if nodes.count(node) > 1})

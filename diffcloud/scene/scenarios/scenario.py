@@ -1,4 +1,4 @@
-"""A scene and how an experiment looks at it: which frame, which faces, which bounds."""
+"""A scene with the settings of an experiment: compared frames, sampled faces, bounds."""
 
 from __future__ import annotations
 
@@ -18,47 +18,47 @@ from diffcloud.sim.properties import PARAMETERS, Properties, check_values, scale
 from diffcloud.sim.system import System
 
 _NO_MATERIAL = 1e-9
-"""What is no more counts as nothing."""
+"""Smaller values are treated as zero."""
 Recorder = Literal["depth_cameras", "whole_surface"]
-"""How synthetic episodes are made: seen by depth cameras with their noise, or points all over the cloth and the first
-obstacle, without noise."""
+"""Source of synthetic episodes: depth cameras with noise, or noise-free points on cloth and first obstacle."""
 
 
 @dataclass(frozen=True)
 class Scenario:
-    """A scene and the settings of an experiment on it."""
+    """A scene and the settings of an experiment with it."""
 
     name: str
     scene: Scene
     frames: int
-    """Simulated frames after the start."""
+    """Number of simulated frames after the start."""
     loss_frames: tuple[int, ...]
-    """Frames of an episode that enter the paper's loss; negative ones count from the end."""
+    """Frames of an episode that the loss of the paper compares; negative numbers count from the end."""
     every_frame: bool = False
-    """Whether the default measure compares all usable frames, not these."""
+    """Whether the default loss compares all usable frames instead of `loss_frames`."""
     loss_faces: NDArray[np.int64] | None = None
-    """Faces whose surface the paper's measure samples; None for all."""
+    """Faces whose surface the loss of the paper samples; None for all."""
     node_sets: Mapping[str, NDArray[np.int64]] = field(default_factory=dict)
-    """Parameter name -> nodes it acts on."""
+    """Parameter -> nodes on which it acts."""
     points: int = 3500
-    """Sampled per frame."""
+    """Number of sampled points per frame."""
     learning_rate: float = 0.2
     iterations: int = 50
     threshold: float = 0.0
-    """Stop when the loss [squared length unit] is below; 0: never."""
+    """Loss [squared length unit] below which a fit stops; 0: never."""
     length_unit_m: float = 1.0
     first_frame_time: float = 0.0
     """Time of a recorded episode's first frame since the start [s]."""
     bounds: Mapping[str, tuple[float, float]] = field(default_factory=dict)
-    """Overrides of the parameters' own bounds."""
+    """Parameter -> bounds that replace its default ones."""
     recorder: Recorder = "depth_cameras"
     uncertain: Mapping[str, float] = field(default_factory=dict)
-    """Material -> factor of one deviation, where it is known less well, or better, than usual (`estimation.uncertain`)."""
+    """Material parameters with another uncertainty than the default -> standard deviation as a factor
+    (`estimation.uncertain`)."""
     initial_state: Mapping[str, float] = field(default_factory=dict)
-    """How far the cloth's start, its size and the gripper's path may be off, which fits find: `turn` [rad], `shape` [m],
-    `size` and `track` [1] (`estimation.initial_state`) -> standard deviation."""
+    """Initial-state variables that fits estimate -> standard deviation: `turn` [rad], `shape` [m], `size` and `track`
+    [1] (`estimation.initial_state`)."""
     regrip: Callable[[float], Scenario] | None = None
-    """The same with a grasp so many standard deviations larger; None: its size is known."""
+    """Function that returns the scenario with a grasp this many standard deviations larger; None: the size is known."""
 
     @property
     def steps(self) -> int:
@@ -66,16 +66,16 @@ class Scenario:
 
     @property
     def grasped(self) -> list[int]:
-        """Nodes that a moving handle holds."""
+        """Nodes held by moving handles."""
         return [handle.node for handle in self.scene.handles.handles if handle.motion is not None]
 
     def with_steps(self, times: int) -> Scenario:
-        """The same experiment with so many times the steps."""
+        """Return the same scenario with `times` as many steps per frame."""
         return replace(self, scene=replace(self.scene, frame_steps=times * self.scene.frame_steps), regrip=None)
 
     def finer(self) -> Scenario:
-        """The same experiment on a mesh with half the edge length (`Scene.finer`). What lies between two nodes of a set
-        belongs to it, and what a face is cut into has the face's part in the loss."""
+        """Return the same scenario with half the edge length (`Scene.finer`). A new node between two nodes of a set
+        belongs to the set. The parts of a loss face are loss faces."""
         _, edges = refined(self.scene.mesh)
         first = len(self.scene.mesh.nodes)
         sets = {
@@ -86,9 +86,10 @@ class Scenario:
         return replace(self, scene=self.scene.finer(), node_sets=sets, loss_faces=faces, regrip=None)
 
     def check_parameters(self, names: Iterable[str]) -> None:
-        """
+        """Check that the parameters affect the scene.
+
         Raises:
-            ConfigError: a parameter that nothing in the scene depends on.
+            ConfigError: nothing in the scene depends on a parameter.
         """
         if "body_mass" in names and not self.scene.surrounding.bodies:
             raise ConfigError(f"body_mass has no effect in {self.name}, whose scene has no rigid bodies; leave it out.")
@@ -99,19 +100,19 @@ class Scenario:
             )
 
     def nominal(self, name: str) -> float:
-        """Return the value of a parameter in the scenario's own material, in the parameter's unit: what a multiplier of 1
-        stands for. 1 of parameters that are no multipliers."""
+        """Return the nominal value of a parameter in its unit, i.e. the value of multiplier 1. Parameters without a
+        multiplier return 1."""
         quantity = PARAMETERS[name].quantity
         return 1.0 if quantity is None else self.scene.nominal(quantity)
 
     def multipliers(self, values: Mapping[str, float], option: str) -> dict[str, float]:
-        """Convert values in SI units to those of the simulator and the fits: multipliers on the scenario's own material.
+        """Convert values in SI units to the inputs of simulator and fits: multipliers of the nominal material.
 
         Args:
-            option: where the values were stated, for messages.
+            option: origin of the values, for messages.
 
         Raises:
-            ConfigError: an unknown parameter, a value that it cannot have, or a parameter that the scene has nothing of.
+            ConfigError: a parameter is unknown or has no effect in this scene, or a value is out of range.
         """
         found = {}
         for name, value in values.items():
@@ -125,10 +126,10 @@ class Scenario:
         return found
 
     def search_range(self, stated: Mapping[str, tuple[float, float]]) -> dict[str, tuple[float, float]]:
-        """Return bounds of multipliers: the scenario's own, and in their place those that are stated in SI units.
+        """Return bounds of multipliers: the stated ones, converted from SI units, and else the scenario's own.
 
         Raises:
-            ConfigError: as of `multipliers`.
+            ConfigError: see `multipliers`.
         """
         low, high = (self.multipliers({name: pair[end] for name, pair in stated.items()}, "bounds") for end in (0, 1))
         return {**self.bounds, **{name: (low[name], high[name]) for name in stated}}
@@ -138,10 +139,10 @@ class Scenario:
         return {name: value * self.nominal(name) for name, value in values.items()}
 
     def fitted_scene(self, values: Mapping[str, float]) -> Scene:
-        """The scene with parameters written into its material, its air, its friction and its bodies.
+        """Return the scene with parameters applied to its material, air, friction and bodies.
 
         Raises:
-            ConfigError: an unknown parameter, or one that acts on a part of the nodes, which no material can say.
+            ConfigError: a parameter is unknown, or acts on a part of the nodes, which a material cannot express.
         """
         check_values(values, self.name)
         self.check_parameters(values)
@@ -186,7 +187,7 @@ class Scenario:
         )
 
     def value(self, name: str) -> float:
-        """Of a parameter in this scenario, 1 where it is a factor; zero where the scene has nothing that it acts on."""
+        """Return a parameter's simulator input in this scenario (1 for multipliers); zero if it has no effect."""
         quantity = PARAMETERS[name].quantity
         if quantity is not None:
             return 1.0 if self.scene.nominal(quantity) > _NO_MATERIAL else 0.0
@@ -197,10 +198,10 @@ class Scenario:
         return found if found > _NO_MATERIAL else 0.0
 
     def properties(self, system: System, values: Mapping[str, Tensor]) -> Properties:
-        """Physical quantities of parameter sets, name -> [B], with the scenario's node sets applied.
+        """Return the physical properties of parameter sets, name -> [B], including the scenario's node sets.
 
         Raises:
-            ConfigError: an unknown parameter.
+            ConfigError: a parameter is unknown.
         """
         sets = {}
         for name in values.keys() & self.node_sets.keys():

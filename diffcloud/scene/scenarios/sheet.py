@@ -1,4 +1,4 @@
-"""A material as a person measures it: an isotropic sheet in SI units, in a scenario's YAML file."""
+"""Isotropic material in SI units, as stated in a scenario's YAML file."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _SOLID = ("density_kg_m3", "youngs_modulus_pa", "thickness_m")
 
 
 class Sheet(Checked):
-    """An isotropic material: what hand tests of a fabric give, or what describes a solid sheet (rubber, foam, paper)."""
+    """An isotropic material, from tests of a fabric strip or from the properties of a solid sheet such as rubber."""
 
     density_kg_m2: Positive | None = None
     stretching_n_m: Positive | None = None
@@ -26,7 +26,7 @@ class Sheet(Checked):
     thickness_m: Positive | None = None
     poisson: Annotated[float, Field(ge=0, lt=1)] = 0.0
     shear_n_m: Positive | None = None
-    """Shear force per width per shear angle; without, that of an isotropic sheet, stretching / (2 (1 + poisson))."""
+    """Shear force per width per shear angle. Default: that of an isotropic sheet, stretching / (2 (1 + poisson))."""
     damping_s: NonNegative = FABRIC_DAMPING
 
     @model_validator(mode="after")
@@ -38,7 +38,7 @@ class Sheet(Checked):
         return self
 
     def material(self, name: str) -> Material:
-        """The material under a name."""
+        """Return the material with the given name."""
         thickness, modulus = self.thickness_m or 0.0, self.youngs_modulus_pa or 0.0
         return isotropic(
             name,

@@ -1,4 +1,4 @@
-"""Material that is known only within a factor, as people state it: bending=1.5x,friction=2x."""
+"""Parsing of uncertain material such as bending=1.5x,friction=2x."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from diffcloud.sim.properties import PARAMETERS
 
 
 def parse_uncertain(text: str) -> dict[str, float]:
-    """What `--uncertain` says -> parameter -> factor of one deviation.
+    """Parse the text of `--uncertain` to parameter -> standard deviation as a factor.
 
     Args:
-        text: "none", or parameters with the factor within which each is known, as in "bending=1.5x,air_density=1.3x".
+        text: "none", or parameters with factors such as "bending=1.5x,air_density=1.3x".
 
     Raises:
-        ConfigError: an unknown or repeated parameter, or not a factor above 1.
+        ConfigError: a parameter is unknown or repeated, or a factor is not above 1.
     """
     found: dict[str, float] = {}
     for item in [] if text.strip() == "none" else text.split(","):

@@ -1,4 +1,4 @@
-"""A vest lowered by one shoulder until it hangs on a hook inside it: the built-in `vest_hang`."""
+"""The built-in `vest_hang`: a vest that is lowered at one shoulder until it hangs on a hook."""
 
 from __future__ import annotations
 
@@ -17,35 +17,33 @@ from diffcloud.scene.scenarios.scenario import Scenario
 from diffcloud.scene.scenarios.sheet import Sheet
 
 _CLEARANCE = 0.015
-"""Least distance between the shoulder and the hook at the start [m]: below it the straps converge on the hook."""
+"""Minimum initial distance between shoulder and hook [m]; closer, the straps start in contact with the hook."""
 
 
 class VestScenario(ScenarioOptions):
-    """A vest that keeps its shape, held out level by one shoulder, over a level hook that reaches through an arm hole.
-
-    The front looks down, the shoulders to -y. The gripper holds the shoulder at +x; the hook comes from +x, inside the
-    vest, and ends under that shoulder's neck end. Everything here may change in a YAML file.
-    """
+    """A shaped vest, held level at one shoulder, over a level hook that reaches through an arm hole. The front faces
+    down, and the shoulders point to -y. The gripper holds the shoulder at +x. The hook comes from +x inside the vest,
+    and ends below the neck end of that shoulder. A YAML file may set every field."""
 
     material: str | Sheet = "foam"
     shaped: bool = True
     contact_thickness_m: Length = 0.008
     contact_stiffness: NonNegative = 3e6
     width_m: Length = 0.40
-    """Of a panel, flat."""
+    """Width of a flat panel."""
     height_m: Length = 0.47
-    """From the hem to the shoulder, flat."""
+    """Height of a flat panel from the hem to the shoulder."""
     depth_m: Length = 0.063
     """Half the distance between front and back."""
     center_m: tuple[Coordinate, Coordinate, Coordinate] = (0.0, 0.0, 1.0)
-    """The middle of the hem."""
+    """Centre of the hem."""
     hook_radius_m: Length = 0.0125
     hook_length_m: Length = 0.36
     hook_sides: Annotated[int, Field(ge=3, le=1000)] = 16
     hook_inset_m: Length = 0.09
-    """From the shoulder to the hook's axis, towards the hem."""
+    """Distance from the shoulder to the hook's axis, towards the hem."""
     hook_reach_m: Length = 0.047
-    """How far the hook reaches under the shoulder, from its arm end."""
+    """Length of the hook below the shoulder, from its arm end."""
 
 
 VEST_HANG = VestScenario(
@@ -60,14 +58,14 @@ VEST_HANG = VestScenario(
 )
 
 _LEVEL = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
-"""Lays a standing vest down: what looked to -y looks down, what was up points to -y."""
+"""Rotation from a standing to a lying vest: -y becomes down, up becomes -y."""
 
 
 def vest_scenario(options: VestScenario) -> Scenario:
-    """The scenario of a vest over a hook.
+    """Return the scenario of a vest over a hook.
 
     Raises:
-        SceneError: a hook that starts too close to the shoulder, or that reaches as far as the held node.
+        SceneError: the hook starts too close to the shoulder, or reaches as far as the held node.
     """
     vest = vest_cloth(options.width_m, options.height_m, options.depth_m)
     held = vest_shoulder(1)

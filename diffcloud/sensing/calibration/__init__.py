@@ -1,1 +1,1 @@
-"""Where the cameras stand: boards, the chain from gripper to pixel, and what was entered wrongly."""
+"""Camera calibration: boards, the kinematic chain from gripper to pixel, and checks for wrong inputs."""

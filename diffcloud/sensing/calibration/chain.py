@@ -1,17 +1,17 @@
-"""The chain from the robot's base over gripper and board to pixels, and its least-squares fit.
+"""Least-squares fit of the kinematic chain from the robot's base over gripper and board to pixels.
 
 For corner X of the board, gripper pose i and camera c:
 
     pixel = project_c( inverse(T_world_camera_c) · T_world_gripper_i · T_gripper_board · s X )
 
-Cameras and board are fitted on reprojection errors with a robust loss (soft L1). The board's size s and each camera's
-focal length are taken as entered, or fitted too: the arm measures both, since it says how far the board has moved.
-Across the image, that distance over the board's size is what the image shows, whatever the focal length; along the view,
-the focal length is what fits.
+Camera poses and board pose are fitted to reprojection errors with a robust loss (soft L1). The board's size s and each
+camera's focal length are fixed at the entered values, or fitted too. The arm makes both identifiable, because it
+measures how far the board moved.
 
-The covariance is a jackknife over poses (one Gauss-Newton step each; the sandwich estimator CR3 of Bell and McCaffrey
-2002): errors of the robot's own kinematics move all corners of a pose together, so counting corners as independent would be
-far too sure. The plain sandwich clustered by pose is still too sure by half with ten poses.
+The covariance is a jackknife over poses, with one Gauss–Newton step each (the sandwich estimator CR3 of Bell and
+McCaffrey 2002). Kinematic errors of the robot move all corners of a pose together. Treating corners as independent
+would underestimate the uncertainty strongly. With ten poses, even the plain sandwich estimator clustered by pose is too
+small by half.
 """
 
 from __future__ import annotations
@@ -36,28 +36,28 @@ _DIFFERENCE = 1e-6
 
 @dataclass(frozen=True)
 class Estimate:
-    """A fitted factor of something that was entered."""
+    """Estimated ratio of the true value to an entered one."""
 
     value: float
-    """True over entered: 1 where it was entered right."""
+    """True value divided by entered value."""
     deviation: float
-    """Standard deviation."""
+    """Standard deviation of the ratio."""
 
 
 @dataclass(frozen=True)
 class Chain:
-    """A fitted chain."""
+    """Result of the fit."""
 
     cameras: dict[str, Floats]
-    """[4, 4] T_world_camera by camera."""
+    """[4, 4] T_world_camera of each camera."""
     board: Floats
-    """[4, 4] T_gripper_board."""
+    """[4, 4] pose of the board on the gripper, T_gripper_board."""
     covariance: dict[str, Floats]
-    """[6, 6] by camera: translation [m], rotation [rad], on the world's side."""
+    """[6, 6] for each camera: translation [m] and rotation [rad], as left perturbations in the world."""
     board_size: Estimate | None = None
-    """None where the size was taken as entered."""
+    """Estimated size ratio; None if the size was fixed."""
     focal_length: dict[str, Estimate] = field(default_factory=dict)
-    """By camera, likewise."""
+    """Estimated focal length ratio of each camera; empty if fixed."""
 
 
 def fit_chain(
@@ -70,17 +70,17 @@ def fit_chain(
     *,
     sizes: bool = False,
 ) -> Chain:
-    """Fit cameras and board.
+    """Fit the poses of cameras and board.
 
     Args:
-        T_world_gripper: [P, 4, 4].
-        groups: [P] which poses are one and the same; the clusters of the covariance.
-        corners: [K, 3] of the board as entered [m].
-        start, board: where to begin.
+        T_world_gripper: [P, 4, 4] gripper poses.
+        groups: [P] number of the distinct pose; the clusters of the covariance.
+        corners: [K, 3] corners of the board as entered [m].
+        start, board: initial poses of cameras and board.
         sizes: fit the board's size and the focal lengths too.
 
     Raises:
-        CalibrationError: it does not converge.
+        CalibrationError: the fit does not converge.
     """
     from scipy.optimize import least_squares  # slow to import
 
@@ -93,11 +93,11 @@ def fit_chain(
         loss="soft_l1",
         f_scale=_ROBUST_PX,
         x_scale="jac",
-        tr_solver="lsmr",  # the default's SVD of so tall a matrix spends its time on threads
+        tr_solver="lsmr",  # the default SVD of such a tall matrix is slow
     )
     if not np.isfinite(fit.x).all():
         raise CalibrationError("The refinement did not converge; check that gripper poses and images belong together.")
-    # the covariance is that of steps from the fitted poses, not from the start
+    # the covariance refers to steps from the fitted poses, not from the start
     after, zero = before.after(fit.x), np.zeros(before.width)
     clusters = np.concatenate([np.repeat(groups[camera.stacked[0]], 2) for camera in cameras.values()])
     covariance = _clustered_covariance(after.errors(zero), after.jacobian(zero), clusters)
@@ -111,19 +111,17 @@ def fit_chain(
 
 @dataclass(frozen=True)
 class _Standing:
-    """Where everything stands, and what steps from there do to the errors.
-
-    A step has 6 entries for each camera and 6 for the board (translation, rotation vector), then logarithms of the factors,
-    if there are any: one for the board's size and one for each camera's focal length.
-    """
+    """Current estimate of all poses, and the errors after a step from it. A step has 6 entries for each camera and 6
+    for the board (translation, rotation vector). If sizes are fitted, it also has logarithms of the factors of the
+    board's size and of each camera's focal length."""
 
     cameras: Mapping[str, CameraViews]
     T_world_gripper: Floats
     corners: Floats
     placed: dict[str, Floats]
-    """T_world_camera."""
+    """T_world_camera of each camera."""
     board: Floats
-    """T_gripper_board."""
+    """Pose of the board on the gripper, T_gripper_board."""
     factors: Floats | None
 
     @property
@@ -131,11 +129,11 @@ class _Standing:
         return 6 * (len(self.cameras) + 1) + (0 if self.factors is None else len(self.factors))
 
     def errors(self, step: Floats) -> Floats:
-        """[2 N] reprojection errors of all corners that all cameras saw [px]."""
+        """Return reprojection errors [2 N] of all corners in all cameras [px]."""
         return np.concatenate([self._errors(name, step[self._columns(name)]) for name in self.cameras])
 
     def jacobian(self, step: Floats) -> Floats:
-        """[2 N, width] by central differences: a handful of parameters and a cheap chain do not repay formulas."""
+        """Return derivatives [2 N, width] by central differences, which are fast enough for so few parameters."""
         blocks = []
         for name in self.cameras:
             columns = self._columns(name)
@@ -150,14 +148,14 @@ class _Standing:
         return np.concatenate(blocks)
 
     def after(self, step: Floats) -> _Standing:
-        """Where everything stands after a step."""
+        """Return the estimate after a step."""
         index = 6 * len(self.cameras)
         placed = {name: _moved(self.placed[name], step[self._columns(name)][:6]) for name in self.cameras}
         factors = None if self.factors is None else self.factors * np.exp(step[index + 6 :])
         return replace(self, placed=placed, board=_moved(self.board, step[index : index + 6]), factors=factors)
 
     def _columns(self, name: str) -> Integers:
-        """Entries of a step that this camera's errors depend on: camera, board, size, focal length."""
+        """Return the step entries that affect this camera's errors: camera, board, size, focal length."""
         index, count = list(self.cameras).index(name), len(self.cameras)
         board = 6 * count
         own = [*range(6 * index, 6 * index + 6), *range(board, board + 6)]
@@ -178,13 +176,13 @@ class _Standing:
 def in_camera(
     T_world_camera: Floats, T_world_gripper: Floats, T_gripper_board: Floats, poses: Integers, points: Floats
 ) -> Floats:
-    """Board points [N, 3], each at one of the gripper poses [P, 4, 4] (`poses` [N]), in the camera's frame."""
+    """Transform board points [N, 3] to the camera's frame. `poses` [N] are indices of gripper poses [P, 4, 4]."""
     chain = (inverse(T_world_camera) @ T_world_gripper @ T_gripper_board)[poses]
     return np.einsum("nij,nj->ni", chain[:, :3, :3], points) + chain[:, :3, 3]
 
 
 def _moved(matrix: Floats, step: Floats) -> Floats:
-    """A pose after a step [6] (translation, rotation vector) on the left of each: (t + dt, exp(dr) R)."""
+    """Apply a step [6] (translation, rotation vector) to a pose from the left: (t + dt, exp(dr) R)."""
     result = matrix.copy()
     result[:3, 3] += step[:3]
     result[:3, :3] = Rotation.from_rotvec(step[3:]).as_matrix() @ matrix[:3, :3]
@@ -192,7 +190,7 @@ def _moved(matrix: Floats, step: Floats) -> Floats:
 
 
 def _clustered_covariance(residual: Floats, jacobian: Floats, clusters: Integers) -> Floats:
-    """One-step jackknife over clusters (the CR3 sandwich) of robust least squares."""
+    """Return the one-step jackknife covariance over clusters (CR3 sandwich) of robust least squares."""
     weight = 1 / np.sqrt(1 + (residual / _ROBUST_PX) ** 2)  # derivative of the loss
     information = jacobian.T @ (weight[:, None] * jacobian)
     names = np.unique(clusters)

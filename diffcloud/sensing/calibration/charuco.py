@@ -1,4 +1,4 @@
-"""A printed ChArUco board, and what cameras see of it."""
+"""ChArUco boards and their detection in images."""
 
 from __future__ import annotations
 
@@ -21,17 +21,17 @@ FEWEST_CORNERS = 6
 
 @dataclass(frozen=True)
 class CharucoBoard:
-    """A printed board; measure its squares with a calliper."""
+    """A printed board. Measure its squares with a calliper."""
 
     columns: int = 5
-    """Squares."""
+    """Number of squares in a row."""
     rows: int = 7
     square_m: float = 0.03
     marker_m: float = 0.022
     dictionary: str = "DICT_5X5_100"
     legacy: bool = False
-    """Whether the board has the pattern of OpenCV before 4.6, which calib.io prints too. With an even number of rows, the
-    top left square then is white, with a marker. Corners have the same numbers and places."""
+    """Whether the board has the pattern of OpenCV before 4.6, which calib.io also prints. It differs only for an even
+    number of rows: the top left square is then white, with a marker. Corner numbers and positions are the same."""
 
     def __post_init__(self) -> None:
         if min(self.columns, self.rows) < 3 or not 0 < self.marker_m < self.square_m < 1:
@@ -41,10 +41,10 @@ class CharucoBoard:
             )
 
     def opencv(self) -> Any:
-        """The board of cv2.aruco.
+        """Return the board as an object of cv2.aruco.
 
         Raises:
-            CalibrationError: an unknown dictionary.
+            CalibrationError: the dictionary is unknown.
         """
         import cv2
 
@@ -60,18 +60,16 @@ class CharucoBoard:
 
     @property
     def patterns(self) -> tuple[CharucoBoard, ...]:
-        """The boards that may have been printed from these figures: with an even number of rows, also the legacy one."""
+        """All patterns with these dimensions; with an even number of rows, this includes the legacy pattern."""
         return (self,) if self.rows % 2 else (self, replace(self, legacy=not self.legacy))
 
     def corners(self) -> Floats:
-        """[K, 3] inner corners in the board's frame: x right, y down, z into the board [m]."""
+        """Return inner corners [K, 3] in the board's frame: x right, y down, z into the board [m]."""
         return np.asarray(self.opencv().getChessboardCorners(), dtype=np.float64).reshape(-1, 3)
 
     def detect(self, color: NDArray[np.uint8]) -> tuple[NDArray[np.int64], Floats]:
-        """(corner numbers [N], pixels [N, 2]) in an image [H, W, 3]; empty where the board is not seen.
-
-        Corners on one line are not enough: the board may stand at any angle about it.
-        """
+        """Return (corner numbers [N], pixels [N, 2]) in an image [H, W, 3]; empty if the board is not detected. Corners
+        on a single line are rejected, because they leave the rotation about the line undetermined."""
         import cv2
 
         detector = cv2.aruco.CharucoDetector(self.opencv())
@@ -81,22 +79,22 @@ class CharucoBoard:
         numbers = np.asarray(numbers, np.int64).reshape(-1)
         seen = self.corners()[numbers]
         across = float(np.linalg.svd(seen - seen.mean(axis=0), compute_uv=False)[1])
-        if across < self.square_m / 2:  # one corner beside a line of others gives more
+        if across < self.square_m / 2:  # even one corner beside a line exceeds this
             return np.zeros(0, np.int64), np.zeros((0, 2))
         return numbers, np.asarray(pixels, np.float64).reshape(-1, 2)
 
 
 @dataclass(frozen=True)
 class View:
-    """What one camera saw of the board at one gripper pose."""
+    """Detection of the board by one camera at one gripper pose."""
 
     pose: int
     numbers: NDArray[np.int64]
-    """[N] corners."""
+    """[N] corner numbers."""
     pixels: Floats
-    """[N, 2]."""
+    """[N, 2] corner positions."""
     depth_m: Floats | None = None
-    """[N] measured at the corners; NaN where there is none."""
+    """[N] depth measured at the corners; NaN if missing."""
     frame: int = -1
     """Index of the image, for pictures."""
 
@@ -109,26 +107,26 @@ class CameraViews:
     views: tuple[View, ...]
 
     def without(self, poses: set[int]) -> CameraViews:
-        """The views of the other poses."""
+        """Return the views without those of the given poses."""
         return CameraViews(self.intrinsics, tuple(view for view in self.views if view.pose not in poses))
 
     def only(self, poses: set[int]) -> CameraViews:
-        """The views of these poses."""
+        """Return the views of the given poses."""
         return CameraViews(self.intrinsics, tuple(view for view in self.views if view.pose in poses))
 
     @cached_property
     def stacked(self) -> tuple[NDArray[np.int64], NDArray[np.int64], Floats]:
-        """Of all corners of all views: poses [N], corner numbers [N], pixels [N, 2]."""
+        """Poses [N], corner numbers [N] and pixels [N, 2] of all corners in all views."""
         poses = np.concatenate([np.full(len(view.numbers), view.pose) for view in self.views])
         numbers = np.concatenate([view.numbers for view in self.views])
         return poses, numbers, np.concatenate([view.pixels for view in self.views])
 
 
 def board_in_camera(view: View, corners: Floats, intrinsics: Intrinsics) -> Floats:
-    """[4, 4] T_camera_board from one view alone (perspective-n-point); `corners` [K, 3] in the board's frame [m]."""
+    """Return T_camera_board [4, 4] from one view (perspective-n-point), with board corners [K, 3] [m]."""
     import cv2
 
-    # distortion is taken out first, in the camera's own convention
+    # undistort first, in the camera's own convention
     plane = np.ascontiguousarray(rays(view.pixels, intrinsics)[:, :2])
     done, turn, shift = cv2.solvePnP(corners[view.numbers], plane, np.eye(3), np.zeros(5), flags=cv2.SOLVEPNP_ITERATIVE)
     if not done:
@@ -139,7 +137,7 @@ def board_in_camera(view: View, corners: Floats, intrinsics: Intrinsics) -> Floa
 
 
 def depth_at(depth: NDArray[np.uint16], pixels: Floats) -> Floats:
-    """[N] median of the valid depths in 3 x 3 pixels around each of `pixels` [N, 2], NaN where there is none."""
+    """Return the median [N] of the valid depths in 3 x 3 pixels around `pixels` [N, 2]; NaN without any."""
     column, row = np.rint(pixels).astype(int).T
     offset = np.arange(-1, 2)
     rows = (row[:, None, None] + offset[:, None]).clip(0, depth.shape[0] - 1)

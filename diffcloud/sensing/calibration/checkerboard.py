@@ -1,8 +1,8 @@
-"""Registering a camera by a checkerboard whose corners the robot knows: the paper's method.
+"""Registration of a camera with a checkerboard whose corners are known in the robot's frame: the paper's method.
 
 The camera's corner points come from its depth image. Their depth is noisy, so z is first replaced by the least-squares
-plane z = a x + b y + c (vertical, not orthogonal distances: that is what the published calibration does), then the rigid
-motion onto the robot's points follows in closed form (Kabsch 1976).
+plane z = a x + b y + c. (Vertical instead of orthogonal distances, like the published calibration.) The rigid transform
+to the robot's points then follows in closed form (Kabsch 1976).
 """
 
 from __future__ import annotations
@@ -20,19 +20,19 @@ Floats = NDArray[np.float64]
 
 _STRIPS = 5
 _FEWEST_HELD_OUT = 9
-"""Three corners each way."""
+"""Minimum number of corners for held-out errors: three along each side."""
 
 
 @dataclass(frozen=True)
 class Registration:
-    """A registered camera."""
+    """Result of a registration."""
 
     T_world_camera: Floats
-    """[4, 4] maps camera points to the robot's base frame [m]."""
+    """[4, 4] transform from the camera to the robot's base frame [m]."""
     residual_m: Floats
-    """[N] distance of each corner, moved from the plane, to where the robot says it is."""
+    """[N] distances of the transformed plane points to the robot's corners."""
     scale: float
-    """Size of the robot's board over that of the camera's: 1 for a right depth scale. The motion does not apply it."""
+    """Size of the robot's board divided by that in the camera; 1 is correct. The transform does not include it."""
 
     @property
     def rms_m(self) -> float:
@@ -40,14 +40,15 @@ class Registration:
 
 
 def register_checkerboard(camera_points: Floats, robot_points: Floats) -> Registration:
-    """Where a camera stands, from corners it saw and the same corners in the robot's frame.
+    """Return the pose of a camera from corners in its frame and the same corners in the robot's frame.
 
     Args:
         camera_points: [N, 3] in the camera's frame [m].
         robot_points: [N, 3] in the base frame [m], in the same order.
 
     Raises:
-        CalibrationError: shapes differ, fewer than 4 corners, corners on a line, or numbers that are not finite.
+        CalibrationError: shapes differ, there are fewer than 4 corners, corners are collinear, or values are not
+            finite.
     """
     if camera_points.shape != robot_points.shape or camera_points.ndim != 2 or camera_points.shape[1] != 3:
         raise CalibrationError(
@@ -68,7 +69,7 @@ def register_checkerboard(camera_points: Floats, robot_points: Floats) -> Regist
 
 
 def checkerboard_evidence(found: Registration, camera_points: Floats, robot_points: Floats) -> CheckerboardEvidence:
-    """Evidence for and against a registration, from the points it was made of."""
+    """Return quality figures of a registration, from the points it was computed with."""
     held_out = held_out_errors(camera_points, robot_points)
     apart = np.linalg.norm(robot_points[:, None] - robot_points, axis=-1) + np.diag(np.full(len(robot_points), np.inf))
     return CheckerboardEvidence(
@@ -81,16 +82,14 @@ def checkerboard_evidence(found: Registration, camera_points: Floats, robot_poin
 
 
 def held_out_errors(camera_points: Floats, robot_points: Floats) -> Floats | None:
-    """How far corners that were left out lie from where the others put them: [M] distances [m].
+    """Return distances [M] [m] of left-out corners to their positions from a registration with the others.
 
-    They are left out in strips across the board, along both of its axes.
-
-    A corner left out is moved as the published method moves all: at the depth of the plane through the others. Strips,
-    because corners of one depth image are wrong together: a neighbour would vouch for the one left out. What all corners
-    share, such as the board's place under the robot, no corner left out can show.
+    Corners are left out in strips across the board, along both axes. They are transformed as in the published method,
+    at the depth of the plane through the others. Strips are used because errors of nearby corners are correlated.
+    Errors that all corners share, such as the board's position under the robot, do not appear here.
 
     Args:
-        camera_points, robot_points: as for `register_checkerboard`.
+        camera_points, robot_points: see `register_checkerboard`.
 
     Returns:
         None for fewer than 9 corners.
@@ -112,12 +111,12 @@ def held_out_errors(camera_points: Floats, robot_points: Floats) -> Floats | Non
 
 
 def onto_plane(points: Floats) -> Floats:
-    """Points [N, 3] with z replaced by their least-squares plane z = a x + b y + c."""
+    """Return points [N, 3] with z replaced by their least-squares plane z = a x + b y + c."""
     return _at_depth(points, _plane(points))
 
 
 def rigid_motion(source: Floats, target: Floats) -> Floats:
-    """[4, 4] rotation and translation that bring `source` [N, 3] nearest to `target` [N, 3], in closed form."""
+    """Return the rigid transform [4, 4] that best maps `source` [N, 3] to `target` [N, 3], in closed form."""
     centres = source.mean(axis=0), target.mean(axis=0)
     u, singular, vt = np.linalg.svd((source - centres[0]).T @ (target - centres[1]))
     if singular[1] < 1e-9 * singular[0]:
@@ -130,7 +129,7 @@ def rigid_motion(source: Floats, target: Floats) -> Floats:
 
 
 def _plane(points: Floats) -> Floats:
-    """(a, b, c) of z = a x + b y + c."""
+    """Return (a, b, c) of the least-squares plane z = a x + b y + c."""
     design = np.column_stack([points[:, :2], np.ones(len(points))])
     coefficients, _, rank, _ = np.linalg.lstsq(design, points[:, 2], rcond=None)
     if rank < 3:

@@ -1,7 +1,7 @@
-"""Whether a calibration may be used, and what is suspected where it may not.
+"""Checks whether a calibration is usable, and which input is suspected if it is not.
 
-Lengths come from three sources: the arm (how far the board moved), the board (its squares, as entered, seen through the
-focal length), and depth. A source that is wrong disagrees with the others, each in a way of its own:
+Lengths come from three sources: the arm (how far the board moved), the board (its squares as entered, seen with the
+focal length), and depth. Each wrong source disagrees with the others in its own pattern:
 
     wrong          size of the board by the arm   focal length by the arm   depth over the board's
     square size    off                            right                     off by as much, in all cameras
@@ -9,7 +9,8 @@ focal length), and depth. A source that is wrong disagrees with the others, each
     focal length   right                          off, in this camera       off by as much, in this camera
     depth scale    right                          right                     off, in this camera
 
-An *objection* is a reason not to use the calibration; a *warning* is about something that leaves the cameras' places right.
+An *objection* is a reason not to use the calibration. A *warning* is about a problem that does not affect the camera
+poses.
 """
 
 from __future__ import annotations
@@ -32,47 +33,48 @@ Floats = NDArray[np.float64]
 Note = tuple[Literal["warning", "objection"], str]
 
 FEWEST_POSES = 5
-"""Fewer cannot be solved for."""
+"""Minimum number of poses for a solution."""
 HELD_OUT_POSES = 10
-"""Fewer give no held-out error to rely on. Simulated with an arm that is off by 1 mm and 0.2 degrees at each pose, nine in
-ten cameras that were calibrated at five poses stood 6 to 28 mm out of place, at held-out errors of 2 to 5 mm."""
+"""Minimum number of poses for a reliable held-out error. Five poses were simulated with arm errors of 1 mm and 0.2
+degrees. Nine in ten cameras were then wrong by 6 to 28 mm, although the held-out errors were only 2 to 5 mm."""
 ADVISED_POSES = 15
 LARGEST_ERROR_MM = 10.0
-"""Held out."""
+"""Maximum held-out error."""
 _LARGEST_TURN_DEG = 5.0
-"""Between how arm and board turn, median over pairs of poses; right ones differ by tenths."""
+"""Maximum median difference between rotations of arm and board. Correct ones differ by tenths of a degree."""
 _HINT, _WRONG = 0.01, 0.02
-"""Two per cent at a metre are 20 mm of depth, and a board that is wrong by as much moves a camera by 13 mm."""
+"""Relative errors for a warning and for an objection. Two percent at 1 m are 20 mm of depth. A board wrong by two
+percent moves a camera by 13 mm."""
 _SURE = 4.0
-"""Standard deviations; ten poses estimate those themselves only roughly."""
+"""Significance limit in standard deviations. It is high because ten poses estimate these only roughly."""
 _SMALLEST_DEVIATION = 0.003
-"""Of a focal length; that depth follows it exactly holds only for a board that faces the camera."""
+"""Minimum standard deviation of a focal length. Depth follows it exactly only for a board that faces the camera."""
 _CHECKERBOARD_WRONG = 0.05
-"""Of the board's size. One placement does not tell board from camera; 20 cm before or behind the board, where cloth is
-recorded, this is the 10 mm that are allowed elsewhere."""
+"""Maximum relative error of the checkerboard's size. At 20 cm from the board, where cloth is recorded, it corresponds
+to the 10 mm that are allowed elsewhere. A single board pose cannot separate errors of board and camera."""
 
 
 @dataclass(frozen=True)
 class CameraEvidence:
-    """What is known of one camera's calibration."""
+    """Quality figures of one camera's calibration."""
 
     poses: int
     held_out_poses: int
     rms_px: float | None
-    """On held-out poses; None without any."""
+    """RMS reprojection error at held-out poses; None without any."""
     rms_mm: float | None
     rms_fit_px: float
-    """On the poses that were fitted."""
+    """RMS reprojection error at the fitted poses."""
     rms_fit_mm: float
     focal_px: float
-    """As entered."""
+    """Focal length as entered."""
     focal: Estimate
-    """By the arm, over the entered one."""
+    """Focal length according to the arm, divided by the entered one."""
     depth_ratio: float | None
-    """Measured depth over that of the board as entered; None without depth."""
+    """Measured depth divided by the depth of the board as entered; None without depth."""
 
     def residuals(self) -> dict[str, float]:
-        """For the calibration file."""
+        """Return the figures for the calibration file."""
         optional = {"rms_px": self.rms_px, "rms_mm": self.rms_mm, "depth_scale": self.depth_ratio}
         return {
             **{key: value for key, value in optional.items() if value is not None},
@@ -86,23 +88,23 @@ class CameraEvidence:
 
 @dataclass(frozen=True)
 class CheckerboardEvidence:
-    """What is known of a registration by a checkerboard."""
+    """Quality figures of a checkerboard registration."""
 
     corners: int
     held_out_corners: int
     held_out_mm: float | None
-    """None where there are too few corners to hold any out."""
+    """None if there are too few corners."""
     size_ratio: float
-    """Size of the board that the camera saw over the one that the robot knows."""
+    """Size of the board seen by the camera, divided by that in the robot's frame."""
     pitch_m: float
-    """Distance of neighbouring corners that the robot knows."""
+    """Distance of neighbouring corners in the robot's frame."""
 
 
 def check_reach(positions: Floats) -> None:
-    """Refuse tool positions [N, 3] that no arm reaches.
+    """Check that tool positions [N, 3] are within an arm's reach.
 
     Raises:
-        CalibrationError: more than three metres from the base, as millimetres are.
+        CalibrationError: a position is more than three metres from the base, e.g. because it is in millimetres.
     """
     wrong = unreachable(positions)
     if wrong is not None:
@@ -110,20 +112,20 @@ def check_reach(positions: Floats) -> None:
 
 
 def check_orientations(cameras: Mapping[str, CameraViews], T_world_gripper: Floats, corners: Floats) -> None:
-    """Refuse tool orientations that do not turn as the board does.
+    """Check that the tool rotates like the board.
 
-    From one pose to another both turn by the same angle, and about axes that one rotation, that of the board on the
-    gripper, takes from one to the other, wherever the camera stands.
+    Between two poses, both rotate by the same angle. One fixed rotation, that of the board on the gripper, maps the
+    axes of one to those of the other, whatever the camera's pose.
 
     Raises:
-        CalibrationError: names the order of the quaternion if that explains it, or else what may.
+        CalibrationError: the rotations differ; names the order of the quaternion if this explains it, or other causes.
     """
     for name, camera in cameras.items():
         boards = np.stack([board_in_camera(view, corners, camera.intrinsics)[:3, :3] for view in camera.views])
         arm = Rotation.from_matrix(T_world_gripper[[view.pose for view in camera.views], :3, :3])
         off = _turn_mismatch_deg(Rotation.from_matrix(boards), arm)
         if off > _LARGEST_TURN_DEG:
-            # the inverse; and what was stored as (x, y, z, w) but read as (w, x, y, z) differs from it by fixed rotations
+            # (x, y, z, w) read as (w, x, y, z) equals the inverse up to fixed rotations
             inverted = _turn_mismatch_deg(Rotation.from_matrix(boards), arm.inv())
             reason = (
                 "Their inverses would fit, or the same numbers as x, y, z, w: robot.csv takes the tool in the base frame, "
@@ -166,7 +168,7 @@ def judge_hand_eye(
 
 
 def judge_checkerboard(cameras: Mapping[str, CheckerboardEvidence]) -> tuple[list[str], list[str]]:
-    """(warnings, objections) about registrations by a checkerboard that the robot knows."""
+    """Return (warnings, objections) about registrations with a checkerboard that is known in the robot's frame."""
     notes: list[Note] = []
     for name, camera in cameras.items():
         if camera.held_out_mm is None:
@@ -202,13 +204,13 @@ def judge_checkerboard(cameras: Mapping[str, CheckerboardEvidence]) -> tuple[lis
 
 
 def _size_notes(cameras: Mapping[str, CameraEvidence], board: Estimate, square_m: float) -> Iterator[Note]:
-    """What arm, board and depth say of each other's lengths (the table above)."""
+    """Yield notes about disagreements between the lengths of arm, board and depth (see the table above)."""
     size, size_deviation = float(np.log(board.value)), board.deviation / board.value
     depth = {name: float(np.log(held.depth_ratio)) for name, held in cameras.items() if held.depth_ratio is not None}
     common = _common(list(depth.values()))
     entered, by_arm = 1000 * square_m, 1000 * square_m * board.value
     explained = 0.0
-    """Of the depth ratios, by the board."""
+    """Part of the depth ratios that a wrong board explains."""
     if abs(size) > max(_HINT, _SURE * size_deviation):
         with_arm = [abs(ratio - size) < abs(ratio) for ratio in depth.values()]
         said = f"by how the arm moves the board its squares are {by_arm:.1f} mm, entered are {entered:.1f} mm"
@@ -216,7 +218,7 @@ def _size_notes(cameras: Mapping[str, CameraEvidence], board: Estimate, square_m
             suspect = f"the board's square size, or the scale of the arm's positions: {said}"
         elif np.mean(with_arm) > 0.5:
             suspect = f"the board's square size: {said}, and depth agrees with the arm"
-            explained = size if common is None else common  # by depth more exactly
+            explained = size if common is None else common  # depth is more accurate
         else:
             suspect = f"the scale of the arm's positions: {said}, and depth agrees with what was entered"
         yield "objection" if abs(size) > _WRONG else "warning", f"Suspected is {suspect}."
@@ -230,13 +232,17 @@ def _size_notes(cameras: Mapping[str, CameraEvidence], board: Estimate, square_m
         )
     for name, held in cameras.items():
         off = depth[name] - explained if name in depth else 0.0
-        # of two cameras the other would have seen a wrong board too
+        # with two cameras, a wrong board would affect both
         board_too = len(depth) == 1 and not explained and abs(off - size) < _SURE * size_deviation
         yield from _camera_notes(name, held, off, board_too=board_too)
 
 
 def _camera_notes(name: str, camera: CameraEvidence, off: float, *, board_too: bool) -> Iterator[Note]:
-    """About one camera whose depth is `off` (logarithm of the ratio) the board's, beyond what the board explains."""
+    """Yield notes about one camera.
+
+    Args:
+        off: logarithm of its depth ratio, without the part that a wrong board explains.
+    """
     focal = float(np.log(camera.focal.value))
     deviation = max(camera.focal.deviation / camera.focal.value, _SMALLEST_DEVIATION)
     measures = f"Camera {name} measures depth {_percent(off)} off the board's geometry"
@@ -268,18 +274,18 @@ def _camera_notes(name: str, camera: CameraEvidence, off: float, *, board_too: b
 
 
 def _common(values: list[float]) -> float | None:
-    """The value in which all agree, if it is not nothing."""
+    """Return the value on which all agree; None if they differ or agree on zero."""
     if not values or max(values) - min(values) > _HINT or min(map(abs, values)) <= _HINT:
         return None
     return float(np.median(values))
 
 
 def _turn_mismatch_deg(board: Rotation, arm: Rotation) -> float:
-    """Median over all pairs of poses of what is left between how both turn, after the best rotation of the axes."""
+    """Return the median difference between rotations of board and arm over pairs of poses, after axis alignment."""
     one, other = np.triu_indices(len(board), 1)
     seen, told = ((turns[one].inv() * turns[other]).as_rotvec() for turns in (board, arm))
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)  # turns about one axis leave the rotation about it open: any will do
+        warnings.simplefilter("ignore", UserWarning)  # for rotations about one axis, any solution will do
         held, _ = Rotation.align_vectors(seen, told)
     return float(np.rad2deg(np.median(np.linalg.norm(seen - held.apply(told), axis=1))))
 

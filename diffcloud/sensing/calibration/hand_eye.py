@@ -1,9 +1,9 @@
-"""Calibrating fixed cameras with a ChArUco board on the gripper.
+"""Calibration of fixed cameras with a ChArUco board on the gripper.
 
-A hand-eye solution of each camera alone starts a joint least-squares fit of all cameras and the one board
-(`chain`). The error that is stated is held out: poses are left out in turn, the rest is fitted from its own start,
-and what that fit says of the poses left out, in pixels and in millimetres, is the number to believe. Then all poses are
-used. `checks` says whether the result may be used.
+A hand-eye solution of each camera initialises a joint least-squares fit of all cameras and the board (`chain`). The
+reported error comes from cross-validation: poses are left out in turn, the others are fitted from their own hand-eye
+solution, and the errors at the left-out poses are collected in pixels and millimetres. The final fit uses all poses.
+`checks` decides whether the result is usable.
 """
 
 from __future__ import annotations
@@ -43,36 +43,37 @@ _STILL_WINDOW_S = 0.1
 
 @dataclass(frozen=True)
 class HandEyeResult:
-    """Cameras and board."""
+    """Poses of cameras and board, with quality figures."""
 
     T_world_camera: Mapping[str, Floats]
     T_gripper_board: Floats
     covariance: Mapping[str, Floats]
-    """[6, 6] by camera: translation [m], rotation [rad], on the world's side."""
+    """[6, 6] for each camera: translation [m] and rotation [rad], as left perturbations in the world."""
     residuals: Mapping[str, Mapping[str, float]]
-    """By camera: rms_px and rms_mm on held-out poses and how many those are (held_out_poses; without any, neither rms is
-    there), rms_fit_px and rms_fit_mm of the fit itself, poses, focal_scale (its focal length by the arm over the entered
-    one), and depth_scale (measured depth over that of the board as entered) where depth was there."""
+    """Quality figures of each camera. rms_px and rms_mm are errors at held_out_poses held-out poses (missing if there
+    are none). rms_fit_px and rms_fit_mm are those of the fit. poses is their number. focal_scale is the focal length
+    according to the arm divided by the entered one. depth_scale is measured depth divided by that of the entered board,
+    if there is depth."""
     board_size: Estimate
-    """The board's size by the arm over the entered one."""
+    """Size of the board according to the arm, divided by the entered one."""
     warnings: tuple[str, ...] = ()
     objections: tuple[str, ...] = ()
-    """Why this calibration is not to be used; empty for a good one."""
+    """Reasons not to use this calibration; empty for a good one."""
 
 
 def find_views(
     cameras: Mapping[str, RawCamera], robot: RobotLog, board: CharucoBoard
 ) -> tuple[dict[str, CameraViews], Floats]:
-    """Detections in the still frames of a raw episode, one per gripper pose and camera.
+    """Detect the board in the still frames of a raw episode, once per gripper pose and camera.
 
-    Where the board may have been printed in two patterns, the one with more corners in all images together is taken: few
-    markers of one pattern can be mistaken for the other, many cannot.
+    If the board may have one of two patterns, the one with more corners in all images is chosen. A few markers may be
+    mistaken for those of the other pattern, but not many.
 
     Returns:
-        Views by camera, and the gripper poses [P, 4, 4] that they number.
+        Views by camera, and the gripper poses [P, 4, 4] to which they refer.
 
     Raises:
-        CalibrationError: a joint log without tool poses or in other units, or a camera without colour images.
+        CalibrationError: the joint log lacks tool poses or has wrong units, or a camera has no colour images.
     """
     check_reach(robot.tool_position_m)
     if not all(np.isfinite(column).all(axis=1).any() for column in (robot.tool_position_m, robot.tool_quaternion)):
@@ -90,7 +91,7 @@ def find_views(
 def _detected(
     cameras: Mapping[str, RawCamera], robot: RobotLog, board: CharucoBoard
 ) -> tuple[dict[str, CameraViews], Floats]:
-    """Detect the board as `find_views` does, but in one pattern only: that of `board`."""
+    """Detect the board like `find_views`, but only in the pattern of `board`."""
     found: dict[str, CameraViews] = {}
     poses: list[Floats] = []
     for name, camera in cameras.items():
@@ -118,7 +119,7 @@ def _detected(
 
 
 def still_pose(robot: RobotLog, t_s: float) -> Floats | None:
-    """[4, 4] of the gripper at a time, interpolated; None while it moves or where the log does not reach."""
+    """Return the interpolated gripper pose [4, 4] at a time; None while it moves or outside the log."""
     around = np.array([t_s - _STILL_WINDOW_S, t_s, t_s + _STILL_WINDOW_S])
     known = np.isfinite(robot.tool_position_m).all(axis=1) & np.isfinite(robot.tool_quaternion).all(axis=1)
     times = robot.times[known]
@@ -135,14 +136,14 @@ def still_pose(robot: RobotLog, t_s: float) -> Floats | None:
 
 
 def calibrate_hand_eye(cameras: Mapping[str, CameraViews], T_world_gripper: Floats, board: CharucoBoard) -> HandEyeResult:
-    """Place all cameras and the board.
+    """Calibrate all cameras and the board.
 
     Args:
-        T_world_gripper: [P, 4, 4] gripper poses, which the views number.
+        T_world_gripper: [P, 4, 4] gripper poses to which the views refer.
 
     Raises:
-        CalibrationError: too few poses, the gripper did not turn about two axes, or its poses are in other units; says what
-            to record.
+        CalibrationError: there are too few poses, the gripper did not rotate about two axes, or units are wrong. States
+            what to record.
     """
     check_reach(T_world_gripper[:, :3, 3])
     groups = _pose_groups(T_world_gripper)
@@ -177,7 +178,7 @@ def calibrate_hand_eye(cameras: Mapping[str, CameraViews], T_world_gripper: Floa
 
 
 def _fitted(cameras: Mapping[str, CameraViews], T_world_gripper: Floats, groups: Integers, corners: Floats) -> Chain:
-    """From the hand-eye solution of the same views alone."""
+    """Fit the chain, starting from the hand-eye solution of the same views."""
     start = {name: _hand_eye(camera, T_world_gripper, corners) for name, camera in cameras.items()}
     first = next(iter(cameras))
     board = _board_on_gripper(cameras[first], T_world_gripper, corners, start[first])
@@ -187,11 +188,9 @@ def _fitted(cameras: Mapping[str, CameraViews], T_world_gripper: Floats, groups:
 def _held_out(
     cameras: Mapping[str, CameraViews], T_world_gripper: Floats, groups: Integers, corners: Floats
 ) -> dict[str, tuple[Floats, Floats, int]]:
-    """By camera, errors [N] in pixels and millimetres at poses that the fit had not seen, and how many poses.
-
-    A pose is held out for all cameras at once, with every other visit to it. Folds are dealt so that each camera loses its
-    poses evenly. Too few poses for folds are left out one by one.
-    """
+    """Return errors [N] in pixels and millimetres at held-out poses, and the number of these poses, for each camera. A
+    pose is held out for all cameras at once, together with repeated visits. Folds are balanced, so that each camera
+    loses about the same number of poses. If there are few poses, each is left out separately."""
     seen = {name: {int(groups[view.pose]) for view in camera.views} for name, camera in cameras.items()}
     order = sorted(set().union(*seen.values()), key=lambda group: ([group in held for held in seen.values()], group))
     count = _FOLDS if len(order) >= HELD_OUT_POSES else len(order)
@@ -205,7 +204,7 @@ def _held_out(
                 {name: camera.without(views) for name, camera in cameras.items()}, T_world_gripper, groups, corners
             )
         except CalibrationError:
-            continue  # these poses stay without a figure, and the count says so
+            continue  # these poses have no error, and are not counted
         for name, camera in cameras.items():
             test = camera.only(views)
             if test.views:
@@ -217,11 +216,9 @@ def _held_out(
 
 
 def _hand_eye(camera: CameraViews, T_world_gripper: Floats, corners: Floats) -> Floats:
-    """[4, 4] T_world_camera of one camera, by Park and Martin's method.
-
-    OpenCV solves for a camera on the gripper. Here the camera stands and the board moves, so the inverted gripper poses go
-    in and the camera in the base frame comes out.
-    """
+    """Return T_world_camera [4, 4] of one camera by the method of Park and Martin. OpenCV solves for a camera on the
+    gripper. Here the camera is fixed and the board moves. So the inverted gripper poses are passed, and the result is
+    the camera in the base frame."""
     import cv2
 
     if len(camera.views) < 3:
@@ -237,14 +234,14 @@ def _hand_eye(camera: CameraViews, T_world_gripper: Floats, corners: Floats) -> 
     )
     matrix = np.eye(4)
     matrix[:3, :3], matrix[:3, 3] = rotation, np.asarray(translation).ravel()
-    # where the poses contradict each other it may also come out as a mirror image
+    # contradictory poses may also give a reflection
     if not np.isfinite(matrix).all() or np.linalg.det(matrix[:3, :3]) < 0.5:
         raise CalibrationError("The hand-eye start failed: turn the gripper about two axes by 20 degrees and more.")
     return matrix
 
 
 def _board_on_gripper(camera: CameraViews, T_world_gripper: Floats, corners: Floats, T_world_camera: Floats) -> Floats:
-    """[4, 4] mean over the views."""
+    """Return T_gripper_board [4, 4], averaged over the views."""
     chains = np.stack(
         [
             inverse(T_world_gripper[view.pose]) @ T_world_camera @ board_in_camera(view, corners, camera.intrinsics)
@@ -260,8 +257,8 @@ def _board_on_gripper(camera: CameraViews, T_world_gripper: Floats, corners: Flo
 def _errors(
     camera: CameraViews, T_world_gripper: Floats, corners: Floats, T_world_camera: Floats, T_gripper_board: Floats
 ) -> tuple[Floats, Floats]:
-    """Reprojection [N] in pixels, and in millimetres the distance [N] between corners where the camera alone puts them
-    (from the view's own board pose) and where the robot does."""
+    """Return reprojection errors [N] in pixels, and position errors [N] in millimetres. A position error is the
+    distance between a corner from the view's own board pose and from the robot's chain."""
     poses, numbers, pixels = camera.stacked
     local = in_camera(T_world_camera, T_world_gripper, T_gripper_board, poses, corners[numbers])
     off = np.linalg.norm(project(local, camera.intrinsics) - pixels, axis=1)
@@ -272,7 +269,7 @@ def _errors(
 
 
 def _depth_ratio(camera: CameraViews, corners: Floats) -> float | None:
-    """Measured depth over that of the board as entered, by each view alone, median; None without depth."""
+    """Return measured depth divided by that of the entered board in each view, median; None without depth."""
     ratios = []
     for view in camera.views:
         if view.depth_m is not None:
@@ -293,7 +290,7 @@ def _check_poses(name: str, camera: CameraViews, T_world_gripper: Floats, groups
         )
     rotations = Rotation.from_matrix(T_world_gripper[[view.pose for view in camera.views], :3, :3])
     turns = np.rad2deg((rotations * rotations[0].inv()).as_rotvec())
-    # about how many axes, and by how much: the second singular value is the turning beside the main axis
+    # the second singular value is the rotation about axes other than the main one
     spread = np.linalg.svd(turns, compute_uv=False) / np.sqrt(len(turns))
     if spread[1] < _SMALLEST_TURN_DEG / 2:
         raise CalibrationError(
@@ -304,8 +301,8 @@ def _check_poses(name: str, camera: CameraViews, T_world_gripper: Floats, groups
 
 
 def _pose_groups(T_world_gripper: Floats) -> Integers:
-    """[P] number of the first pose that each is the same as. A second visit, or another camera's image of the same halt,
-    is no pose of its own: held out beside it, it would be known already."""
+    """Return the number [P] of the first equal pose for each pose. Repeated visits, and images of other cameras at the
+    same stop, are the same pose. They must be held out together."""
     groups = np.full(len(T_world_gripper), -1)
     for index, pose in enumerate(T_world_gripper):
         if groups[index] < 0:
@@ -314,7 +311,7 @@ def _pose_groups(T_world_gripper: Floats) -> Integers:
 
 
 def _same_pose(pose: Floats, others: Floats) -> NDArray[np.bool_]:
-    """[N] whether each of `others` [N, 4, 4] is as good as `pose`."""
+    """Return whether each of `others` [N, 4, 4] is nearly equal to `pose`, bool [N]."""
     between = inverse(pose) @ others
     turned = Rotation.from_matrix(between[:, :3, :3]).magnitude()
     return (np.linalg.norm(between[:, :3, 3], axis=1) <= _NEW_POSE_M) & (turned <= _NEW_POSE_RAD)

@@ -1,1 +1,1 @@
-"""What is wrong with a raw episode, fault by fault."""
+"""Validation of raw episodes."""

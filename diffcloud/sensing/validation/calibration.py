@@ -1,4 +1,4 @@
-"""Whether the cameras of a raw episode are those of their calibration, and stand where it says."""
+"""Checks that the cameras of a raw episode match their calibration."""
 
 from __future__ import annotations
 
@@ -18,11 +18,12 @@ from diffcloud.sensing.validation.findings import Finding, RecordedCamera
 
 _SWAP_POINTS = 3000
 _PLANES, _FLAT_M = 200, 0.01
-"""Planes that are tried, and how far off its points may be."""
+"""Number of planes to test, and maximum distance of their points [m]."""
 _TILTED_DEG, _LEVEL_DEG = 8.0, 4.0
-"""Of a table in both views: more with the stated poses, and less with the exchanged ones, is no accident."""
+"""Poses count as exchanged if the table is tilted by more than the first value in both views, and by less than the
+second one after exchanging them."""
 _SWAP_M = 0.02
-"""Views that disagree by more than this, and agree when exchanged, are exchanged."""
+"""Poses count as exchanged if the views differ by more than this [m], but agree after exchanging them."""
 
 
 def _calibration_of(camera: RecordedCamera, folder: Path, calibration: Path | None) -> Calibration | None:
@@ -34,11 +35,11 @@ def _calibration_of(camera: RecordedCamera, folder: Path, calibration: Path | No
 
 
 def calibration_findings(camera: RecordedCamera, folder: Path, calibration: Path | None) -> Iterator[Finding]:
-    """About one camera.
+    """Yield findings about one camera.
 
     Args:
-        folder: of the episode, where camera.json's own calibration file is looked for.
-        calibration: a calibration file that is used instead.
+        folder: folder of the episode, to which camera.json's calibration file is relative.
+        calibration: calibration file to use instead.
     """
     place = f"cameras/{camera.name}/camera.json"
     if camera.info is None:
@@ -100,8 +101,9 @@ def _pose(camera: RecordedCamera, folder: Path, calibration: Path | None) -> NDA
 
 
 def exchanged_cameras(cameras: list[RecordedCamera], folder: Path, calibration: Path | None) -> Iterator[Finding]:
-    """Two views of one scene must agree; where they do so only with each other's pose, the poses are exchanged. The same
-    where the table is level only with the other's pose, and where a folder holds the camera that another is named after."""
+    """Yield findings about exchanged cameras. Poses count as exchanged if two views of one scene agree, or the table is
+    level, only with each other's pose. Folders count as exchanged if one holds the camera that another is named
+    after."""
     names = {camera.name for camera in cameras}
     for camera in cameras:
         if camera.info is not None and camera.info.name != camera.name and camera.info.name in names:
@@ -143,7 +145,7 @@ def exchanged_cameras(cameras: list[RecordedCamera], folder: Path, calibration: 
 
 
 def _plane(cloud: NDArray[np.float64]) -> NDArray[np.float64] | None:
-    """[3] unit normal of the plane that most points lie in, None if that is less than a third of them; seeded."""
+    """Return the unit normal [3] of the plane with the most points; None if it has less than a third of them."""
     rng = np.random.default_rng(0)
     corners = cloud[rng.integers(len(cloud), size=(_PLANES, 3))]
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -161,7 +163,7 @@ def _plane(cloud: NDArray[np.float64]) -> NDArray[np.float64] | None:
 
 
 def _tilt_deg(pose: NDArray[np.float64], normal: NDArray[np.float64] | None) -> float:
-    """How far the plane is from level; NaN without one."""
+    """Return the angle between the plane and the horizontal; NaN without a plane."""
     return np.nan if normal is None else float(np.degrees(np.arccos(np.clip(abs((pose[:3, :3] @ normal)[2]), 0, 1))))
 
 
@@ -178,7 +180,7 @@ def _first_points(camera: RecordedCamera) -> NDArray[np.float64] | None:
 
 
 def _disagreement(first: NDArray[np.float64], second: NDArray[np.float64]) -> float:
-    """Lower quartile of the distances both ways: half of each view may see what the other does not."""
+    """Return the lower quartile of the distances in both directions, since the views may only overlap by half."""
     there, _ = cKDTree(second).query(first)
     back, _ = cKDTree(first).query(second)
     return float(max(np.quantile(there, 0.25), np.quantile(back, 0.25)))

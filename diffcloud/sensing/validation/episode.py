@@ -1,7 +1,5 @@
-"""What is wrong with a raw episode: every fault with the place, what was found, and what to try.
-
-Each check looks at one thing and yields findings; none stops the others, so that one run explains a whole recording.
-"""
+"""Checks of a raw episode. Each finding states the file, what was found, and what to try. The checks are independent,
+so that one run reports all faults of a recording."""
 
 from __future__ import annotations
 
@@ -29,27 +27,27 @@ if TYPE_CHECKING:
     from diffcloud.sensing.robot import Robot
 
 _GAP = 2.5
-"""A gap is this many times the median interval."""
+"""A gap is longer than this multiple of the median interval."""
 NEAREST_M, FARTHEST_M = 0.1, 8.0
-"""Median depth of a table-top scene lies between."""
+"""Plausible range of the median depth of a table-top scene [m]."""
 _GEN3_JOINTS = 7
 _FEWEST_JOINTS = 6
-"""With fewer an arm cannot place its tool: columns are missing, unless a description says otherwise."""
+"""An arm with fewer joints cannot reach arbitrary tool poses, so columns are probably missing."""
 _FAR_RAD, _WINDOW_S = 2.5 * np.pi, 0.5
-"""A joint angle beyond is in degrees, or of a joint that has gone on turning; how fast it is is told by windows so long."""
+"""A joint angle beyond the first value is in degrees, or belongs to a continuous joint. Its speed over windows of the
+second value [s] decides."""
 _ALIKE = ("depth.emitter_enabled", "depth.laser_power", "depth.visual_preset")
 _PACE = "depth.inter_cam_sync_mode"
 _SPARSE = 0.02
-"""Fewer valid pixels than this are a warning."""
+"""Fraction of valid pixels below which a warning is given."""
 
 
 def validate_raw_episode(folder: Path, *, calibration: Path | None = None, robot: Robot | None = None) -> list[Finding]:
-    """All findings about a raw episode, faults first.
+    """Return all findings about a raw episode, faults first.
 
     Args:
-        calibration: a calibration file the cameras should be in; those that camera.json names are read anyway.
-        robot: whose joints robot.csv should have; None where that is not known, which makes another number than the Gen3's
-            a warning.
+        calibration: a calibration file that should contain the cameras. Those that camera.json names are read anyway.
+        robot: robot whose joints robot.csv should have. If None, a number of joints other than the Gen3's is a warning.
     """
     folder = Path(folder)
     if not folder.is_dir():
@@ -168,7 +166,7 @@ def _images(camera: RecordedCamera) -> Iterator[Finding]:
     empty: list[int] = []
     sparse: list[int] = []
     medians: list[float] = []
-    for frame in camera.frames:  # one image after the other, each checked whole
+    for frame in camera.frames:  # image by image, to bound the memory
         path = camera.folder / "depth" / f"{frame:06d}.png"
         where = f"{place}/depth/{path.name}"
         try:
@@ -250,7 +248,7 @@ def _colour(camera: RecordedCamera) -> Iterator[Finding]:
 
 
 def _settings(cameras: list[RecordedCamera]) -> Iterator[Finding]:
-    """Cameras that see one cloth should see it alike."""
+    """Check that all cameras of the episode have equal settings."""
     told = {camera.name: camera.info.settings for camera in cameras if camera.info is not None and camera.info.settings}
     for name, settings in told.items():
         free = [key for key in ("depth.enable_auto_exposure", "color.enable_auto_exposure") if settings.get(key)]
@@ -279,7 +277,7 @@ def _robot(log: RobotLog) -> Iterator[Finding]:
         message = f"Row {bad + 1}: the time runs backwards ({log.times[bad]:.6f} s after {log.times[bad - 1]:.6f} s)."
         yield Finding("fault", "clock_backwards", place, message)
     first, largest = float(np.abs(log.joints_rad[0]).max()), float(np.abs(log.joints_rad).max())
-    # a joint without end may go on for turns, but not for one each second
+    # a continuous joint may make several turns, but not one per second
     if first > _FAR_RAD or (largest > _FAR_RAD and bad is None and _fastest(log) > 2 * np.pi):
         yield Finding(
             "fault",
@@ -314,7 +312,7 @@ def _robot(log: RobotLog) -> Iterator[Finding]:
 
 
 def _fastest(log: RobotLog) -> float:
-    """[rad/s] of any joint, over any half of a second."""
+    """Return the largest speed of any joint over any half second [rad/s]."""
     later = np.minimum(log.times + _WINDOW_S, log.times[-1])
     ahead = np.stack([np.interp(later, log.times, column) for column in log.joints_rad.T], axis=1)
     return float(np.abs(ahead - log.joints_rad).max()) / _WINDOW_S

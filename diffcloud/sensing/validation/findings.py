@@ -1,4 +1,4 @@
-"""What checks of a raw episode say, and what they look at."""
+"""Result type of the checks of a raw episode, and their input."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ from diffcloud.io.raw_episodes import CameraInfo
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing that is wrong, or may be."""
+    """One fault or warning."""
 
     severity: Literal["fault", "warning"]
-    """A fault makes what follows wrong; a warning is worth a look."""
+    """A fault makes later results wrong; a warning should be looked at."""
     code: str
-    """A word to filter by, such as clock_gap."""
+    """Identifier such as clock_gap."""
     place: str
     message: str
 
 
 @dataclass(frozen=True)
 class RecordedCamera:
-    """A camera's folder, as far as it could be read."""
+    """The readable part of a camera's folder."""
 
     name: str
     folder: Path
