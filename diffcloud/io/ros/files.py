@@ -26,8 +26,8 @@ _NUMBERED = re.compile(r"(.*)_(\d+)")
 _DATE = re.compile(r"_?\d{4}-\d{2}-\d{2}-\d{2}-\d{2}-\d{2}")
 """Start time that rosbag1 adds to the name of each part."""
 _ADJOINING_S = 5.0
-"""Largest gap between parts. They adjoin closely, but may start with a slow topic. Between takes the cloth is laid out
-again, which takes longer."""
+"""Largest gap between parts. They adjoin closely, but may start with a slow topic. Between takes, the cloth must
+be spread again, which takes longer."""
 
 
 @contextmanager
