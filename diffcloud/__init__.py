@@ -12,16 +12,16 @@ The public names are in `__all__` and are imported on first use. Lengths are in 
 
 Imports between packages go in one direction (checked by a test):
 
-        mesh, io  <-  sim  <-  scene  <-  arcsim   (sim and scene refer to modules of arcsim by name only)
-        clouds     <- mesh, io
-        estimation <- sim, scene, clouds
-        identification, evaluation <- estimation
-        datasets   <- sim, scene, clouds
-        regressors <- mesh, clouds, io
-        sensing    <- mesh, clouds, io
-        hardware   <- sensing, io                  (packages of cameras and arm are imported when a device is opened)
-        reporting, library <- everything above
-        cli        <- everything; imported only by pipeline (the stages of `dvc repro`) and studies
+    mesh, io  <-  sim  <-  scene  <-  arcsim   (sim and scene refer to modules of arcsim by name only)
+    clouds     <- mesh, io
+    estimation <- sim, scene, clouds
+    identification, evaluation <- estimation
+    datasets   <- sim, scene, clouds
+    regressors <- mesh, clouds, io
+    sensing    <- mesh, clouds, io
+    hardware   <- sensing, io                  (packages of cameras and arm are imported when a device is opened)
+    reporting, library <- everything above
+    cli        <- everything; imported only by pipeline (the stages of `dvc repro`) and studies
 """
 
 from __future__ import annotations

@@ -226,8 +226,7 @@ def find_scenes(
     density: float | tuple[float, float] | None = None,
     grip: float | None = None,
 ) -> list[Scene]:
-    """Build a scene for each recording of a rectangular cloth that first lies flat and is grasped at one or more
-    corners.
+    """Build a scene for each recording of a rectangular cloth that first lies flat and is grasped by its corners.
 
     Args:
         size: side lengths [m]. Default: estimated from the first frames.

@@ -23,8 +23,7 @@ from numba.core.registry import CPUDispatcher
 from numba.core.typed_passes import NativeLowering
 
 _LARGE = 8
-"""If a kernel calls more kernels than this, it is not optimised together with them, because each is optimised
-already."""
+"""A kernel that calls more kernels than this is not optimised with them, since each is optimised already."""
 
 
 class LinkedKernel(CPUDispatcher):

@@ -101,8 +101,7 @@ def simulate_chunk(scenario: Scenario, draws: ParameterDraws, chunk: Chunk) -> S
 def _nodes(
     scenario: Scenario, values: Mapping[str, NDArray[np.float64]]
 ) -> tuple[NDArray[np.float32], Mapping[int, DivergedError]]:
-    """Simulate runs with parameters name -> [b]. Return node positions [b, T+1, V, 3], and the errors of diverged
-    runs."""
+    """Simulate runs with parameters name -> [b]. Return nodes [b, T+1, V, 3], and the errors of diverged runs."""
     system, _ = scenario.scene.build()
     properties = scenario.properties(system, {name: torch.as_tensor(value) for name, value in values.items()})
     with torch.no_grad():

@@ -22,8 +22,7 @@ Draws = Literal["uniform", "sobol", "logarithmic", "modes"]
 
 _MIXED = ("stretching", "density")
 _TRIES = 64
-"""Number of candidate samples per run, of which the first inside the bounds is used. More than half of them are
-inside."""
+"""Number of candidate samples per run. The first one inside the bounds is used; more than half are inside."""
 
 Range = tuple[float, float]
 Mode = tuple[tuple[Range, ...], tuple[Range, ...]]
@@ -165,8 +164,7 @@ class ParameterDraws:
         return self._draw(np.random.default_rng([self.seed, SPLITS.index(split)]), count, self.kind)
 
     def again(self, split: Split, run: int, attempt: int) -> NDArray[np.float64]:
-        """Return new parameters [k] for a run that diverged `attempt` times. Sobol points are replaced by uniform
-        samples."""
+        """Return new parameters [k] for a run that diverged `attempt` times. Sobol points become uniform samples."""
         kind: Draws = "uniform" if self.kind == "sobol" else self.kind
         return self._draw(np.random.default_rng([self.seed, SPLITS.index(split), run, attempt]), 1, kind)[0]
 

@@ -80,8 +80,8 @@ class WorkFolder:
             return None
 
     def publish(self, write: Callable[[Path], list[str]]) -> None:
-        """Write the set with the function `write`, which returns file names. Then remove remains of an old set, and
-        this folder.
+        """Call `write`, which writes the set and returns file names. Then remove remains of an old set, and this
+        folder.
 
         If the process is killed at any time, the old set or no set remains, and the chunks.
         """

@@ -106,8 +106,7 @@ class ArmChecker:
         limits: limits of the tool. The links' space is the workspace box, enlarged by a margin.
 
     Raises:
-        LimitError: the description has no meshes of moving links, or a joint of the arm has no limits and is not
-            continuous.
+        LimitError: no moving link has a mesh, or a joint of the arm has no limits and is not continuous.
     """
 
     def __init__(self, robot: Robot, limits: Limits, arm_limits: ArmLimits) -> None:
@@ -253,8 +252,7 @@ class ArmChecker:
         return ArmWatch(self, name, start, returning=returning)
 
     def excess(self, joints_rad: Floats, gripper: Floats, positions: Floats, *, slack: float) -> Floats:
-        """[T, 12 + J] excess of tool (6 faces) and links (6 faces) [m] and joints [rad] over their limits; negative is
-        inside.
+        """[T, 12 + J] excess over the limits of tool, links (6 faces each) [m] and joints [rad]. Negative is inside.
 
         Args:
             gripper: [T] from 0 (open) to 1 (closed).
@@ -343,8 +341,7 @@ class ArmChecker:
     def _nearest(self, target_rad: Floats, joints_rad: Floats) -> Floats:
         """[J] targets shifted by whole turns to the nearest value within the planned limits.
 
-        If there is none, the nearest value within the joint limits is used, otherwise the nearest one. `_check` refuses
-        these.
+        If there is none, the nearest value within the joint limits, else the nearest one. `_check` refuses these.
         """
         nearest = np.round((joints_rad - target_rad) / (2 * np.pi))
         turns = nearest

@@ -7,8 +7,7 @@ arm. It sends Stop
 
 - if the arm moves and the capture has sent nothing for `watchdog_s` (watchdog),
 - if the socket to the capture closes, because the capture has ended,
-- if the capture requests it. `stop` waits for the arm's confirmation. `halt` does not wait and is safe in a signal
-handler.
+- if the capture requests it. `stop` waits for confirmation. `halt` does not wait and is safe in a signal handler.
 
 If the arm does not confirm a Stop, the child repeats it, then applies the emergency stop, warns the user, and repeats
 again. After a Stop, velocities are refused until the next `prepare`. If a velocity command overlaps with a Stop, a
@@ -170,8 +169,7 @@ class ArmProcess:
         self._stop("emergency_stop")
 
     def halt(self) -> None:
-        """Request a Stop without waiting. The single message is atomic, so a signal handler may call this at any
-        time."""
+        """Request a Stop without waiting. The message is atomic, so a signal handler may call this at any time."""
         with suppress(OSError):  # the child is gone or its queue is full; `stop`, which follows, reports this
             os.write(self._socket.fileno(), _HALT)  # bypass the socket object, which an interrupted call may be using
 

@@ -43,8 +43,7 @@ def apply(rs: Any, sensors: Mapping[str, Any], settings: CameraSettings, camera:
         camera: name of the camera, for messages.
 
     Raises:
-        HardwareError: the camera lacks an option or preset, or a value is out of range. The message lists what is
-            allowed.
+        HardwareError: the camera lacks an option or preset, or a value is out of range.
     """
     depth = sensors["depth"]
     if settings.preset is not None:

@@ -2,9 +2,9 @@
 
 Drivers stamp frames with the computer's time of day or with the camera's own counter. A person or a time server may set
 the time of day during a recording. The monotonic clock of the arm's log cannot be set. So the offset between both
-clocks is measured once, and then checked against frame numbers (frames cannot be faster than the camera's rate) and
-arrival times (frames cannot arrive before they are taken). If a stamp contradicts them, its clock was set, and the
-offset is measured again. Changes of less than half a frame interval backwards, or `_AHEAD_S` forwards, are not noticed.
+clocks is measured once and then checked. Frames cannot be faster than the camera's rate, and cannot arrive before they
+are taken. If a stamp contradicts this, its clock was set, and the offset is measured again. Changes of less than half a
+frame interval backwards, or `_AHEAD_S` forwards, are not noticed.
 """
 
 from __future__ import annotations

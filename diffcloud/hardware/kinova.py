@@ -37,8 +37,7 @@ _SESSION_TIMEOUT_MS = 10_000
 _CONNECTION_TIMEOUT_MS = 500
 """The arm stops if the link is silent for this time (three keep-alives)."""
 _CALL_TIMEOUT_MS = 400
-"""Timeout of one call. It is below the watchdog timeout of the arm's process, so that a lost link is reported as
-such."""
+"""Timeout of one call. It is below the watchdog timeout, so that a lost link is reported as such."""
 _TRANSIENT_S = 3.0
 """Time for which the arm may report manual control after a closed session or a Stop."""
 _FAULTS = {

@@ -190,8 +190,7 @@ class RealSenseCamera:
                 pipeline.stop()
 
     def _timed(self, frame: CameraFrame, depth: Any, arrival_s: float) -> CameraFrame:
-        """Convert the stamp to monotonic time. It is in the computer's time of day or, for some drivers, the camera's
-        clock."""
+        """Convert the stamp to monotonic time. Stamps are in the computer's time of day or the camera's clock."""
         if self._times is None:
             self._times = FrameTimes(
                 f"{self.name} ({self.serial})", 1 / self._fps, longest_s=_QUEUED_PAIRS / self._fps + _LONGEST_WAY_S
@@ -213,8 +212,7 @@ class RealSenseCamera:
 
 @contextmanager
 def play_recording(path: Path, name: str, *, alone: bool = True) -> Iterator[tuple[CameraInfo, Iterator[CameraFrame]]]:
-    """Open a recording of the SDK (`.db3`, or an old `.bag`). Yields the camera, and frames with depth aligned to
-    colour.
+    """Open a recording of the SDK (`.db3`, or an old `.bag`). Yields the camera and its frames, aligned to colour.
 
     Playback is as fast as frames are consumed, happens once, and drops no frames.
 

@@ -289,6 +289,5 @@ class _ArmRecorder:
 
 
 def _named(where: str, error: Exception) -> DiffCloudError:
-    """Return a DiffCloudError unchanged. Convert others, and add their type, since their message alone may be
-    unclear."""
+    """Return a DiffCloudError unchanged. Convert others, and add their type to the message."""
     return error if isinstance(error, DiffCloudError) else HardwareError(f"{where}: {type(error).__name__}: {error}")

@@ -165,8 +165,7 @@ def check_control_rate(rate_hz: float, gain: float = DEFAULT_GAIN) -> None:
 
 
 def approach(start: Floats, goal: Floats, *, speed_m_s: float) -> ToolTrajectory | None:
-    """Plan a straight minimum-jerk motion from `start` to `goal` [3] with peak `speed_m_s`, or None if they
-    coincide."""
+    """Plan a straight minimum-jerk motion from `start` to `goal` [3] with peak `speed_m_s`. None if they coincide."""
     distance = float(np.linalg.norm(goal - start))
     if distance < 1e-3:
         return None

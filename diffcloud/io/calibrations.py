@@ -1,5 +1,4 @@
-"""Read and write calibration files: the pose of each camera in the robot's base frame, its covariance and its
-residuals.
+"""Read and write calibration files: pose of each camera in the robot's base frame, covariance and residuals.
 
 `raw/calibration/<name>.json` lists cameras by serial number. Each has intrinsics, `T_world_camera` (4 x 4, maps camera
 points to world points [m]) and a 6 x 6 covariance of (translation [m], rotation vector [rad]). Perturbations are on the
@@ -36,8 +35,7 @@ class CameraCalibration:
     T_world_camera: NDArray[np.float64]
     """[4, 4] maps camera points to world points [m]."""
     covariance: NDArray[np.float64] | None = None
-    """[6, 6] covariance of translation [m] and rotation vector [rad], on the world side. None if the method has
-    none."""
+    """[6, 6] covariance of translation [m] and rotation vector [rad], on the world side. None if unknown."""
     name: str = ""
     """User's name of the camera, such as overhead or side."""
     residuals: Mapping[str, float] = field(default_factory=dict)

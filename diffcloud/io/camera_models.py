@@ -77,7 +77,7 @@ class Intrinsics:
         return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
 
     def same_camera(self, other: Intrinsics) -> bool:
-        """Whether both may be the same camera at one resolution: focal lengths within 1 %, principal point within 5
+        """Whether both may be one camera at the same resolution: focal lengths within 1 %, principal point within 5
         px."""
         return (
             (self.width, self.height) == (other.width, other.height)

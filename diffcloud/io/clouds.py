@@ -23,8 +23,7 @@ def read_cloud(path: Path) -> NDArray[np.float32]:
     """Read the points [N, 3] of a cloud file, without colours, normals and other columns.
 
     Raises:
-        EpisodeError: the file is missing, damaged, empty (`EmptyCloudError`), of the wrong shape, or has NaN/Inf
-            points.
+        EpisodeError: the file is missing, damaged, empty (`EmptyCloudError`), of the wrong shape, or not finite.
     """
     path = Path(path)
     check_input(path, kind="cloud", error=EpisodeError)

@@ -38,7 +38,7 @@ def depth_folders(folders: Mapping[str, Path], *, rate_hz: float | None = None) 
         rate_hz: frame rate, if there is no timestamps.csv and names are not times.
 
     Raises:
-        EpisodeError: images, camera JSON or times are missing, frame numbers have gaps, depth is JPEG, times do not
+        EpisodeError: images, camera JSON, times or frame numbers are missing, or depth is JPEG. Also if times do not
             increase or contradict each other, or the rate is invalid.
     """
     cameras = {name: _camera(Path(folder), name) for name, folder in folders.items()}

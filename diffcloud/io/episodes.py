@@ -35,8 +35,7 @@ are replaced by it."""
 _LATEST = 1e3
 """Largest clock offset and largest standard deviation of it [s]."""
 _FASTEST = 100.0
-"""Highest gripper speed [m/s]. It is far above any arm's speed, to allow for scenes whose length unit is a
-decimetre."""
+"""Highest gripper speed [m/s]. It is far above any arm's speed, for scenes whose unit is a decimetre."""
 
 
 @dataclass(frozen=True)
@@ -92,8 +91,7 @@ class Episode:
     """A recorded episode.
 
     Raises:
-        EpisodeError: an array has the wrong shape, a frame is empty, a point is not finite, or times do not
-                increase.
+        EpisodeError: a wrong shape, an empty frame, points that are not finite, or times that do not increase.
     """
 
     points: NDArray[np.float32]
@@ -116,8 +114,7 @@ class Episode:
     """[T, C, bytes] invalid-pixel mask of each of the C `pinholes`, one bit per pixel, row by row. A set bit marks a
     pixel in which the cloth cannot be seen: no depth, robot, robot shadow or image border."""
     meta: Mapping[str, Any] = field(default_factory=dict)
-    """JSON object with labels (scenario, fabric, category, repeat), camera data, true parameters and quality
-    figures."""
+    """Labels (scenario, fabric, category, repeat), camera data, true parameters and quality figures."""
 
     def __post_init__(self) -> None:
         points, offsets, times = self.points, self.offsets, self.times
@@ -168,8 +165,7 @@ class Episode:
             self._refuse_implausible_track(self.gripper)
 
     def _refuse_implausible_track(self, gripper: NDArray[np.float64]) -> None:
-        """Check that each gripper stays near the clouds and has a plausible speed. Simulating other motions would take
-        hours.
+        """Check that each gripper stays near the clouds and has a plausible speed. Others would take hours to simulate.
 
         Raises:
             EpisodeError: a gripper is too far away or too fast.

@@ -142,8 +142,7 @@ def atomic(path: Path) -> Iterator[BinaryIO]:
 
 @contextmanager
 def staged(folder: Path) -> Iterator[Path]:
-    """Yield the path of a temporary folder, not created yet, that is renamed to `folder` if the block ends without an
-    error.
+    """Yield the path of a new temporary folder, which is renamed to `folder` if the block ends without an error.
 
     `folder` must not exist. The next call for the same folder removes what a killed process left behind.
 
@@ -213,8 +212,7 @@ def read_json(path: Path, *, error: type[DiffCloudError] = DiffCloudError, comme
         comments: accept comments (`//`, `/* */` and `#`), as ARCSim does.
 
     Raises:
-        error: the file is missing, not a regular file, too large, not JSON, or has a duplicate key. The message names
-            the file and the position.
+        error: the file is missing, not a regular file, too large, not JSON, or has a duplicate key.
     """
     try:
         text = read_text(path, error=error, most_bytes=_MOST_JSON)
@@ -256,8 +254,7 @@ def read_yaml(path: Path, *, error: type[DiffCloudError] = DiffCloudError, kind:
 
 
 class _PlainLoader(yaml.SafeLoader):
-    """YAML loader with the plain values of YAML 1.2. PyYAML follows YAML 1.1: `1:30` is 90, `010` is 8, `no` is
-    false."""
+    """YAML loader with the plain values of YAML 1.2. In PyYAML's 1.1, `1:30` is 90, `010` is 8, `no` is false."""
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
         self.flatten_mapping(node)
@@ -398,8 +395,7 @@ def folders_in(folder: Path) -> list[Path]:
 
 @contextmanager
 def claimed(output: Path) -> Iterator[None]:
-    """Lock an output (file or folder) against other processes, with a lock file beside it for the duration of the
-    block.
+    """Lock an output (file or folder) against other processes during the block, with a lock file beside it.
 
     Raises:
         OutputError: another process has locked it (the message names the process), or the location is not writable.
@@ -431,8 +427,7 @@ def _hold(lock: Path, output: Path) -> int:
             holder = _holder(descriptor)
             os.close(descriptor)
             raise OutputError(f"{output} is being written by {holder}. Wait for it, stop it, or choose another output.")
-        # The previous owner removes the file before it releases the lock. A lock on a removed file has no effect, so
-        # try again.
+        # The previous owner removes the file before it releases the lock. A lock on a removed file has no effect.
         if os.fstat(descriptor).st_ino == _inode(lock):
             return descriptor
         os.close(descriptor)

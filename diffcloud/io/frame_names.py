@@ -34,8 +34,7 @@ _EPOCH_S = (631_152_000, 4_102_444_800)
 _UNITS = {"seconds": 0, "milliseconds": 3, "microseconds": 6, "nanoseconds": 9}
 _MOST_FRAMES = 100_000_000
 _LEAST_HZ, _MOST_HZ = 0.01, 1000.0
-"""Plausible frame rates, from time-lapse to fast simulation. For other rates, the numbers cannot be times in
-seconds."""
+"""Plausible frame rates, from time-lapse to fast simulation. Other numbers cannot be times in seconds."""
 _SAME_RATE = 0.05
 """Tolerance between a stated frame rate and the rate of times in names, which may be rounded (fraction)."""
 

@@ -35,8 +35,7 @@ def read_tracks(files: Mapping[str, Path], frames: int) -> GripperTracks:
 
     Args:
         files: gripper name -> CSV file with columns x, y, z [m], optionally t_s [s], and one row per frame. A single
-            file may hold several grippers: it has a column `gripper` with their names and one row per frame and
-                gripper.
+            file may hold several grippers: it has a column `gripper`, and one row per frame and gripper.
         frames: number of frames T.
 
     Raises:

@@ -111,8 +111,7 @@ def png_size(path: Path) -> tuple[int, int]:
 
 
 def check_png(data: bytes, name: str) -> None:
-    """Check that all chunks of a PNG are present with valid checksums. OpenCV silently fills a truncated image with
-    zeros.
+    """Check that all chunks of a PNG are present and valid. OpenCV silently fills a truncated image with zeros.
 
     Raises:
         EpisodeError: the data are not a PNG, truncated, damaged, or too large for a camera image.

@@ -38,8 +38,8 @@ def read_cloth(path: Path) -> ClothMesh:
     the node's first vert, or a new one at (x, y) of the node.
 
     Raises:
-        MeshError: a line is not readable, an index is out of range, the mesh cannot be simulated, or edge lengths in
-            the rest shape and between the nodes differ by more than a factor of 1.5.
+        MeshError: a line or index is invalid, or the mesh cannot be simulated. Also if edge lengths in the rest shape
+            and between the nodes differ by more than a factor of 1.5.
     """
     obj = _parse(path)
     verts = list(obj.verts)
@@ -83,8 +83,7 @@ def read_cloth(path: Path) -> ClothMesh:
 
 
 def other_lengths(mesh: ClothMesh) -> tuple[float, str]:
-    """Compare the lengths between the nodes with the rest shape. Return a stretch factor, and a message about the
-    remedy.
+    """Compare the lengths between the nodes with the rest shape. Return a stretch factor and advice to the user.
 
     The factor is the larger of the median principal stretches (or their inverses) over all faces. It is at least 1.
     """

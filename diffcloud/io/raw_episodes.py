@@ -49,8 +49,7 @@ _LATEST_S = 1e6
 MOST_HZ = 1e5
 """Highest frame rate that is accepted [Hz]."""
 _FARTHEST_RAD, _LARGEST = 200.0, 1e5
-"""Largest accepted joint angle [rad] (continuous joints may turn many times), and largest value of the other
-columns."""
+"""Largest accepted joint angle [rad] (continuous joints may turn many times), and value of other columns."""
 _WRENCH = ("wrench_fx", "wrench_fy", "wrench_fz", "wrench_tx", "wrench_ty", "wrench_tz")
 
 
@@ -212,8 +211,7 @@ class RawCamera:
     """[T] [s]."""
 
     def depth(self, index: int) -> NDArray[np.uint16]:
-        """Return the depth image [H, W] of frame `index`, in units of `depth_scale_m`. Pixels without a measurement are
-        0."""
+        """Return the depth image [H, W] of frame `index`, in units of `depth_scale_m`. 0 is no measurement."""
         return read_depth(self.folder / "depth" / f"{self.frames[index]:06d}.png")
 
     def color(self, index: int) -> NDArray[np.uint8] | None:
@@ -307,8 +305,7 @@ def read_description(folder: Path) -> dict[str, Any]:
     """Read and validate episode.json.
 
     Raises:
-        EpisodeError: the file is missing or damaged, has another schema version, lists no camera, or is not in SI
-            units.
+        EpisodeError: the file is missing or damaged, has another schema version, no camera, or other units than SI.
     """
     path = Path(folder) / "episode.json"
     data = read_json(path, error=EpisodeError)

@@ -1,5 +1,4 @@
-"""The common form of imported recordings (cameras, a stream of frames, a joint log), and writing it as a raw
-episode."""
+"""The common form of imported recordings (cameras, frames, joint log), and writing it as a raw episode."""
 
 from __future__ import annotations
 
@@ -48,7 +47,7 @@ class Recording:
 
     cameras: Mapping[str, CameraInfo]
     frames: Iterable[RecordedFrame]
-    """In order of time for each camera. The iterable may be consumed only once."""
+    """Frames in order of time for each camera. The iterable may be consumed only once."""
     source: str
     robot: RobotLog | None = None
     """Joint log on the clock of the frames."""
@@ -159,8 +158,7 @@ def read_joint_log(path: Path, *, offset_s: float = 0.0, recording_start_s: floa
             start at the first frame. Otherwise both are assumed to have the same clock.
 
     Raises:
-        EpisodeError: the log is missing or damaged, its times do not increase, or it has another clock than the
-            recording.
+        EpisodeError: the log is missing or damaged, its times do not increase, or its clock is another one.
     """
     log = read_robot_log(path)
     if not len(log.times):

@@ -141,8 +141,7 @@ class SimulatedSet:
         """Read and check one split.
 
         Raises:
-            DatasetError: a file is missing, damaged or inconsistent. The message names the file and the expected
-                contents.
+            DatasetError: a file is missing, damaged or inconsistent.
         """
         folder = Path(folder)
         if split not in SPLITS:

@@ -90,8 +90,8 @@ def read_urdf(path: Path) -> RobotDescription:
     """Read a URDF and its meshes: the visual geometry, or the collision geometry of links without a visual one.
 
     Raises:
-        RobotError: the file is missing or damaged, a mesh is missing or outside the URDF's folder, a joint type or
-            shape is unknown, or the links do not form a tree. The message names the element.
+        RobotError: a file is missing or damaged, or a mesh is outside the URDF's folder. Also if a joint type or shape
+            is unknown, or the links do not form a tree. The message names the element.
     """
     path = Path(path)
     root = _xml(path)

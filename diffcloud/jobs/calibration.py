@@ -1,5 +1,4 @@
-"""Calibrate all cameras of a setup from images of a ChArUco board, or from checkerboard points that the robot
-touched."""
+"""Calibrate all cameras of a setup from images of a ChArUco board, or from points touched by the robot."""
 
 from __future__ import annotations
 

@@ -82,8 +82,7 @@ def write_evaluation(
     as_json: bool,
     references: Mapping[tuple[str, str], float] | None = None,
 ) -> dict[str, Any]:
-    """Write metrics, wall times and tables, print the main ones, and return all metrics. metrics.json has the main
-    ones.
+    """Write metrics, wall times and tables, print the main ones, and return all metrics.
 
     Args:
         fits: folder with <scenario>/<episode>.json.
@@ -135,7 +134,7 @@ def printed(told: Mapping[str, pd.DataFrame]) -> list[Table]:
 
 
 def _curves(config: Config, fits: Path) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
-    """For all fits: the loss of each iteration, and the RMS of each frame."""
+    """Return the loss of each iteration and the RMS of each frame, for all fits."""
     curves: list[dict[str, Any]] = []
     residuals: list[dict[str, Any]] = []
     named = [path for name in config.scenes for path in files_in(fits / name, ".json")]

@@ -112,8 +112,7 @@ class FitJob:
         return record
 
     def begun(self) -> FitRecord:
-        """Write and return the start of the fit as an interrupted fit, for an interrupt before the first loss
-        evaluation.
+        """Write and return the start of the fit, for an interrupt before the first loss evaluation.
 
         Raises:
             DivergedError: the simulation diverges at the start.

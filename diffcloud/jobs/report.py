@@ -108,8 +108,7 @@ def write_report(
 
 
 def _loss_frames(fit: Path, scenario: str) -> tuple[int, ...]:
-    """Loss frames of a fit's scenario. A published scenario is known without its scene file, which may be missing
-    here."""
+    """Loss frames of a fit's scenario. Those of published scenarios are known without the scene file."""
     if scenario in RELEASE:
         return (RELEASE[scenario].loss_frame,)
     return choose_scenario(fitted_scenario(fit, scenario)).loss_frames

@@ -56,8 +56,7 @@ def scenario_options(name: str) -> Options:
 
 
 def fitted_scenario(fit: Path, name: str) -> str:
-    """Find the scenario of a fit: the file that `diffcloud fit` wrote beside it, a built-in or own one, or a local
-    file.
+    """Find the scenario of a fit: a file written beside the fit, a built-in or own scenario, or a local file.
 
     Args:
         fit: JSON file of the fit.

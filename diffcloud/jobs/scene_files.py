@@ -36,8 +36,7 @@ def find_scene(
     mass: float | None,
     topics: Sequence[str] = (),
 ) -> tuple[dict[str, Episode], dict[str, Any], dict[str, dict[str, Any]]]:
-    """Read the recordings and their scene. What cloth.yaml and recordings.yaml do not state is detected and added to
-    them.
+    """Read the recordings and their scene. Values missing in cloth.yaml and recordings.yaml are estimated and added.
 
     Args:
         topics: topics of ROS recordings to use if there are several candidates (`ros_recording`).

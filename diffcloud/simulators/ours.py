@@ -54,8 +54,7 @@ def scene(problem: Problem, order: Order = 2) -> Scene:
 
 
 def simulate(problem: Problem, *, steps: int = STEPS, order: Order = 2) -> Track:
-    """Simulate with `steps` time steps per frame. For a problem that settles, return only the start and the rest
-    state."""
+    """Simulate with `steps` time steps per frame. For a problem that settles, return only start and rest state."""
     described = replace(scene(problem, order), frame_steps=steps)
     count = (len(problem.times) - 1) * steps
     if problem.settling:

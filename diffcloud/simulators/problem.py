@@ -18,8 +18,7 @@ from diffcloud.sim.materials import TABLE_ENTRY_TO_BENDING
 from diffcloud.sim.motion import Motion
 
 REST_HEIGHT = 0.0021
-"""Height of nodes at rest on a table [m], given by DiffCloud's contact for a light cloth. Others use it as node
-radius."""
+"""Height of nodes at rest on a table [m] in DiffCloud, for a light cloth. Others use it as node radius."""
 
 _MOTION_RATE = 480
 """Sampling rate of held-node motions for the scripts, which interpolate linearly [1/s]."""
@@ -52,8 +51,7 @@ class Sheet:
 
 @dataclass(frozen=True)
 class Problem:
-    """A cloth, its held nodes, and optional obstacles. There is no air drag; `settling` is the only external
-    damping."""
+    """A cloth, its held nodes, and optional obstacles. The only external damping is `settling`."""
 
     name: str
     mesh: ClothMesh

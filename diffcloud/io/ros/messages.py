@@ -33,8 +33,7 @@ _COLOR_CHANNELS = {"rgb8": (0, 1, 2), "bgr8": (2, 1, 0), "rgba8": (0, 1, 2), "bg
 
 
 def stamp_s(message: Any) -> float:
-    """Return a message's own time stamp [s]. It is 0 if the message was not stamped, or at the start of simulated
-    time."""
+    """Return a message's time stamp [s]. It is 0 if the message was not stamped, or at the start of simulated time."""
     stamp = message.header.stamp
     return float(stamp.sec + 1e-9 * stamp.nanosec)
 
@@ -53,8 +52,7 @@ def depth_encoding(message: Any, topic: str) -> DepthEncoding:
         raise EpisodeError(f"{topic} has the encoding {message.encoding!r}; depth is 16UC1, 32FC1 or compressedDepth.")
     stated, _, compression = (part.strip() for part in message.format.partition(";"))
     if not _is_compressed_depth(message):
-        # A plain compressed image cannot have floats. If it is a 16-bit PNG, it is in millimetres; the decoder refuses
-        # others.
+        # A plain compressed image cannot have floats. A 16-bit PNG is in millimetres; the decoder refuses others.
         if stated == "32FC1":
             raise EpisodeError(f"{topic} has the format {message.format!r}, which loses floats; record compressedDepth.")
         return "16UC1"

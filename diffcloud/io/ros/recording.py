@@ -231,8 +231,7 @@ def _scan(paths: Sequence[Path], shown: str, named: Sequence[str]) -> _Scan:
 
 
 def _senders(connections: Sequence[Any]) -> dict[tuple[int, str, int], str]:
-    """Connection -> sender: the node name in ROS 1, otherwise the connection's number among those of its topic and
-    file."""
+    """Connection -> sender: the node name in ROS 1, otherwise the connection's number for its topic and file."""
     senders: dict[tuple[int, str, int], str] = {}
     counts = Counter[tuple[str, int]]()
     for held in connections:
@@ -337,8 +336,7 @@ def _frames(paths: Sequence[Path], sources: Mapping[str, _Source]) -> Iterator[R
 
 
 class _Assembly:
-    """Assembles the frames of one camera. It keeps images only until their frame is complete and all earlier ones are
-    out."""
+    """Assembles the frames of one camera. It keeps images only until their frame has been yielded."""
 
     def __init__(self, name: str, source: _Source) -> None:
         self._name, self._source = name, source

@@ -91,8 +91,7 @@ def refuse_unknown(topics: Mapping[str, str], named: Collection[str], where: str
 
 
 def depth_cameras(topics: Mapping[str, str], where: str, named: Collection[str] = ()) -> dict[str, CameraTopics]:
-    """Find all depth cameras of a recording, by name. If a camera has several depth topics, the one aligned to colour
-    is used.
+    """Find all depth cameras of a recording, by name. Depth aligned to colour is preferred.
 
     Args:
         topics: topic -> message type.
@@ -197,8 +196,7 @@ def _names(keys: list[Key]) -> list[str]:
 
 
 def _colors(topics: Mapping[str, str], cameras: list[Key]) -> dict[Key, tuple[str, ...]]:
-    """Assign colour topics to the camera with which they share most leading name parts. Ambiguous topics are
-    dropped."""
+    """Assign colour topics to the camera with the longest common name prefix. Ambiguous topics are dropped."""
     found: dict[Key, list[tuple[int, str]]] = {camera: [] for camera in cameras}
     for topic in topics:
         shared = {camera: _shared(_key(topic), camera) for camera in cameras}

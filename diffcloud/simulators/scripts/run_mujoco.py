@@ -4,8 +4,8 @@
     python run_mujoco.py              writes nodes.npz: nodes [T, V, 3] [m] at times [T] [s]
     python run_mujoco.py --view       shows it instead; writes nothing
 
-To put the cloth into a model of your own, copy <asset>, <worldbody>, <deformable> and <option> of cloth.xml, and call
-`advance` instead of mj_step, with where your gripper holds the nodes.
+To use the cloth in your own model, copy <asset>, <worldbody>, <deformable> and <option> of cloth.xml. Instead of
+mj_step, call `advance` with the positions in which your gripper holds the nodes.
 """
 
 import argparse

@@ -3,9 +3,9 @@
     pip install newton==1.8.0 warp-lang==1.19.0 numpy
     python run_newton.py              writes nodes.npz: nodes [T, V, 3] [m] at times [T] [s]
 
-To put the cloth into a model of your own, call `add_cloth` with your builder before anything else that has
-particles, then its `color(include_bending=True)`, `finish_cloth` with the finalized model, and move the held nodes in every
-step as `frames` does.
+To use the cloth in your own model, call `add_cloth` with your builder before you add anything else that has particles.
+Then call the builder's `color(include_bending=True)`, and `finish_cloth` with the finalized model. In each step, move
+the held nodes as `frames` does.
 """
 
 import argparse
