@@ -109,7 +109,7 @@ class ToolTrajectory:
 
     @property
     def accelerations(self) -> Floats:
-        """[T, 3] mean accelerations at the keyframes, from rest and to rest, over the adjacent half segments [m/s²]."""
+        """[T, 3] accelerations averaged around each keyframe, from rest and to rest [m/s²]."""
         velocity = np.concatenate([np.zeros((1, 3)), self.velocities, np.zeros((1, 3))])
         span = np.diff(self.times)
         beside = np.concatenate([span[:1], (span[:-1] + span[1:]) / 2, span[-1:]])

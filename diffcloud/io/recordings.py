@@ -154,8 +154,8 @@ def read_joint_log(path: Path, *, offset_s: float = 0.0, recording_start_s: floa
 
     Args:
         offset_s: added to the times of the log.
-        recording_start_s: time of the first frame. If only this time is in seconds since 1970, the log is assumed to
-            start at the first frame. Otherwise both are assumed to have the same clock.
+        recording_start_s: time of the first frame. If only this time is in seconds since 1970, times of the log are assumed
+            to count from the first frame. Otherwise both are assumed to have the same clock.
 
     Raises:
         EpisodeError: the log is missing or damaged, its times do not increase, or its clock is another one.

@@ -131,7 +131,7 @@ class FitJob:
         resolved = [
             self.task.space,
             self.task.solver_settings,
-        ]  # with defaults from outside of these packages
+        ]  # resolved, because defaults may come from other packages
         return fingerprint([self.name, self.recordings, settings, resolved], packages=_CODE)
 
 

@@ -26,7 +26,7 @@ from diffcloud.simulators.problems import Known, cantilever, strip
 Runnable = Literal["mujoco", "newton"]
 _SCRIPTS: dict[Runnable, str] = {"mujoco": "run_mujoco.py", "newton": "run_newton.py"}
 _VBD_STEPS = {"strip": 5_000, "cantilever": 15_000}
-"""Time steps per second with which VBD converges to the analytical solutions. More steps lose accuracy (float32)."""
+"""Number of time steps with which VBD converges to the analytical solutions. More steps lose accuracy (float32)."""
 _MINUTES = 30
 
 
