@@ -1,4 +1,4 @@
-"""DiffCloud: simulator parameters of a real cloth from the point clouds of its motion.
+"""DiffCloud: estimate the simulation parameters of a real cloth from point clouds of its motion.
 
     import diffcloud as dc
 
@@ -8,20 +8,20 @@
     print(found)
     dc.export(found, "mujoco", "mujoco", samples=20)
 
-What is public is in `__all__`. It is imported when it is first used. Lengths are in metres, z points up.
+The public names are in `__all__` and are imported on first use. Lengths are in metres, z is up.
 
-Imports run one way (a test holds this):
+Imports between packages go in one direction (checked by a test):
 
-    mesh, io  <-  sim  <-  scene  <-  arcsim   (sim and scene name modules of arcsim in registries)
+    mesh, io  <-  sim  <-  scene  <-  arcsim   (sim and scene refer to modules of arcsim by name only)
     clouds     <- mesh, io
     estimation <- sim, scene, clouds
     identification, evaluation <- estimation
     datasets   <- sim, scene, clouds
     regressors <- mesh, clouds, io
     sensing    <- mesh, clouds, io
-    hardware   <- sensing, io                  (cameras and arm; their packages are imported when one is opened)
+    hardware   <- sensing, io                  (packages of cameras and arm are imported when a device is opened)
     reporting, library <- everything above
-    cli        <- everything; nothing imports it but pipeline (the stages of `dvc repro`) and studies
+    cli        <- everything; imported only by pipeline (the stages of `dvc repro`) and studies
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 _PLACES = {"FitSettings": "diffcloud.estimation.settings", "Episode": "diffcloud.io.episodes"}
-"""Public name -> module, of those that are not in `library`."""
+"""Module of each public name that is not in `library`."""
 __all__ = [
     "DiffCloudError",
     "Episode",

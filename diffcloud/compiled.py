@@ -1,13 +1,12 @@
-"""Compiled functions and where they are kept.
+"""Compile functions (kernels) with numba, and cache the machine code.
 
-numba compiles a kernel when it is first called and keeps the machine code in a subfolder of the user's cache folder.
-The subfolder is named after a fingerprint of every source that goes into kernels, since numba itself looks at one
-function's file and not at those it calls; so an upgrade compiles again and never mixes versions. Several processes may
-compile at once: files are written atomically. Folders of other versions that nobody has used for 30 days are removed
-when a new one is made.
+numba compiles a kernel on its first call and stores the machine code in the user's cache folder. The subfolder is named
+after a fingerprint of all kernel sources. numba itself checks only a function's own file, not the functions that it
+calls. So an upgrade compiles again and never mixes versions. Several processes may compile at once, since files are
+written atomically. When a new subfolder is created, those of other versions that were unused for 30 days are removed.
 
-`DIFFCLOUD_CACHE_DIR` puts the folder elsewhere. `DIFFCLOUD_UNCOMPILED=1` runs all kernels as plain Python, for a
-debugger; a step then takes seconds.
+`DIFFCLOUD_CACHE_DIR` sets the cache folder. `DIFFCLOUD_UNCOMPILED=1` runs all kernels as plain Python, for a debugger.
+A step then takes seconds.
 """
 
 from __future__ import annotations
@@ -42,16 +41,16 @@ _PACKAGE = Path(__file__).parent
 _KEPT_DAYS = 30
 _OPTIONS: Any = {"nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True}
 _MARK = "complete"
-"""A file in the folder, once everything has been compiled ahead."""
+"""Name of a file in the cache folder that exists once all kernels have been compiled in advance."""
 _PATIENT = (100_000, 50, 100)
-"""Thresholds of the garbage collector while a kernel is compiled; without any, memory would double."""
+"""Thresholds of the garbage collector during compilation. Without a collector, memory usage would double."""
 _log = logging.getLogger(__name__)
 
 F = TypeVar("F", bound=Callable[..., Any])
 
 
 def kernel_sources(package: Path = _PACKAGE) -> Iterator[Path]:
-    """The files whose change compiles again: those that hold kernels, and those that kernels are generated from."""
+    """Yield the files that contain kernels, or from which kernels are generated."""
     for source in sorted(package.rglob("*.py")):
         text = b"\n" + source.read_bytes()
         if b"\n@kernel\n" in text or b"sim.compiled" in text or source.parent == package / "sim" / "compiled":
@@ -59,7 +58,7 @@ def kernel_sources(package: Path = _PACKAGE) -> Iterator[Path]:
 
 
 def fingerprint(package: Path = _PACKAGE) -> str:
-    """16 hexadecimal digits of the compiler's versions, what drives it, and the kernels' sources."""
+    """Hash (16 hexadecimal digits) of the compiler versions, the compiler driver, and the kernel sources."""
     digest = hashlib.sha256(f"{numba.__version__} {llvmlite.__version__}".encode())
     for driver in ("compiled.py", "linked.py"):
         digest.update((_PACKAGE / driver).read_bytes())
@@ -71,19 +70,19 @@ def fingerprint(package: Path = _PACKAGE) -> str:
 
 @cache
 def cache_folder() -> Path:
-    """Where compiled and generated code of this version lies. It is made here, if it can be."""
+    """Return the folder for compiled and generated code of this version. It is created if possible."""
     root = Path(os.environ["DIFFCLOUD_CACHE_DIR"]) if "DIFFCLOUD_CACHE_DIR" in os.environ else user_cache_path("diffcloud")
     folder = root / "kernels" / fingerprint()
-    with suppress(OSError):  # a cache that cannot be written is numba's to report
+    with suppress(OSError):  # numba reports a cache that is not writable
         if not folder.is_dir():
             folder.mkdir(parents=True)
             remove_stale(folder)
-        os.utime(folder)  # when it was last used
+        os.utime(folder)  # record the time of use
     return folder
 
 
 def remove_stale(folder: Path) -> None:
-    """Remove the folders of other versions beside this one that nobody has used for 30 days."""
+    """Remove sibling folders of other versions that were unused for 30 days."""
     for other in folder.parent.iterdir():
         if other == folder or not re.fullmatch("[0-9a-f]{16}", other.name):
             continue
@@ -93,27 +92,27 @@ def remove_stale(folder: Path) -> None:
 
 
 def cache_size() -> int:
-    """Of all files in the folder [bytes]."""
+    """Return the size of all files in the cache folder [bytes]."""
     return sum(file.stat().st_size for file in cache_folder().rglob("*") if file.is_file())
 
 
 def is_built() -> bool:
-    """Whether everything has been compiled ahead."""
+    """Whether all kernels have been compiled in advance."""
     return (cache_folder() / _MARK).is_file()
 
 
 def mark_built() -> None:
-    """Remember that everything has been compiled ahead."""
+    """Record that all kernels have been compiled in advance."""
     cache_folder().mkdir(parents=True, exist_ok=True)
     (cache_folder() / _MARK).touch()
 
 
 def kernel(function: F) -> F:
-    """A function that numba compiles: of arrays, numbers and named tuples of them. It releases the interpreter's lock."""
+    """Compile a function with numba. Arguments are arrays, numbers, and named tuples of them. It releases the GIL."""
     if UNCOMPILED:
         return function
     config: Any = numba.config
-    given, config.CACHE_DIR = config.CACHE_DIR, str(cache_folder())  # of other people's functions, and of this
+    given, config.CACHE_DIR = config.CACHE_DIR, str(cache_folder())  # set our cache folder for this function only
     try:
         return cast(F, LinkedKernel(function, **_OPTIONS))
     finally:
@@ -121,15 +120,15 @@ def kernel(function: F) -> F:
 
 
 Work = Sequence[tuple[str, str]]
-"""Names, and functions as "module:function" that call each kernel once with arguments of the types it is used with."""
+"""Names, and functions as "module:function" that call each kernel once with arguments of all used types."""
 
 
 def compile_all(progress: Callable[[int, str], None], work: Sequence[Work]) -> None:
-    """Compile everything that is not in the cache folder, and remember that it is complete.
+    """Compile everything that is not in the cache folder, and record that it is complete.
 
     Args:
-        progress: called with how many pieces of work are done, and the name of one that is not.
-        work: what compiles; each list one piece after the other, all lists at once, in processes of their own.
+        progress: called with the number of finished pieces of work and the name of an unfinished one.
+        work: pieces of work. Each list runs sequentially in its own process, all lists in parallel.
 
     Raises:
         DiffCloudError: a piece failed.
@@ -153,7 +152,7 @@ def _run(pieces: Work, done: Callable[[str], None]) -> None:
         f"importlib.import_module({module!r}).{function}(); print(flush=True)\n"
         for module, function in (place.split(":") for _, place in pieces)
     )
-    # colours of error messages, of which numba makes thousands that nobody sees, take a twentieth of the time
+    # Colouring error messages, of which numba creates thousands that are never shown, would take 5 % of the time.
     plain = os.environ | {"NUMBA_DISABLE_ERROR_MESSAGE_HIGHLIGHTING": "1"}
     command = [sys.executable, "-c", code]
     with (
@@ -170,8 +169,10 @@ def _run(pieces: Work, done: Callable[[str], None]) -> None:
 
 
 class _Announcement(event.Listener):
-    """Says once in a process that kernels are being compiled, and lets garbage wait meanwhile: looking for it in all that
-    a compiler holds takes a fifth of its time."""
+    """Logs once per process that kernels are being compiled, and reduces garbage collection meanwhile.
+
+    With the default thresholds, garbage collection takes a fifth of the compilation time.
+    """
 
     def __init__(self) -> None:
         self.silent = False

@@ -1,4 +1,4 @@
-"""The terminal: progress and messages on standard error, results on standard output, and the parts of options."""
+"""Terminal output (progress and messages on standard error, results on standard output), and parsing of options."""
 
 from __future__ import annotations
 
@@ -33,14 +33,14 @@ if TYPE_CHECKING:
     from diffcloud.hardware.installed import Check
 
 _QUIET_S = 10.0
-"""Between lines of progress where standard error is no terminal."""
+"""Interval between progress lines if standard error is not a terminal."""
 _LONGEST_S = 3.6e6
 _PLAIN_WIDTH = 140
-"""Columns where the output is a file or a log: tables keep their headings."""
+"""Line width [characters] of output to a file or log. It is wide enough for all table headings."""
 
 
 def _console(*, stderr: bool) -> Console:
-    # names of files and messages hold brackets that are no markup: what has a style is a Text
+    # Markup is off, because file names and messages may contain brackets. Styled output uses Text.
     console = Console(stderr=stderr, highlight=False, markup=False)
     if not console.is_terminal:
         console.width = _PLAIN_WIDTH
@@ -55,24 +55,24 @@ Command = TypeVar("Command", bound=Callable[..., Any])
 
 
 def finish(result: dict[str, Any], as_json: bool) -> None:
-    """Print the machine-readable result, if asked."""
+    """Print the result as JSON, if requested."""
     if as_json:
         sys.stdout.write(json.dumps(result, allow_nan=False) + "\n")
         sys.stdout.flush()
 
 
 def known(number: float | None, form: str) -> str:
-    """A table's cell of a number that may be missing."""
+    """Format a number that may be missing for a table cell."""
     return "–" if number is None else format(number, form)
 
 
 def show(table: Table, as_json: bool) -> None:
-    """Print a table; with --json to standard error, so that standard output stays clean."""
+    """Print a table. With --json, use standard error, so that standard output has only JSON."""
     (errors if as_json else output).print(table)
 
 
 def show_checks(checks: Sequence[Check], as_json: bool) -> None:
-    """Print a report on what is installed, or of a conformance test; see `show`."""
+    """Print the checks of an installation or of a conformance test. See `show`."""
     table = Table("", "state", "detail")
     for check in checks:
         table.add_row(check.name, Text(check.state, "green" if check.state == "ok" else "red"), check.detail)
@@ -84,16 +84,18 @@ def warn(message: str) -> None:
 
 
 def say(head: str, message: str, *, style: str, console: Console | None = None) -> None:
-    """A line whose beginning has a style, on standard error unless another console is given."""
+    """Print a line with a styled beginning, by default on standard error."""
     (console or errors).print(Text.assemble((head, style), " ", message), soft_wrap=True)
 
 
 @contextmanager
 def progress_bar(label: str, total: int | None) -> Iterator[Callable[[float, str], None]]:
-    """A bar on standard error; call with (done, text). Where that is no terminal, a line every ten seconds.
+    """Show a progress bar on standard error. Yields a function to call with (done, text).
+
+    Without a terminal, a line is printed every ten seconds.
 
     Args:
-        total: work that is planned; None: it is not known how much there will be, and no remaining time is shown.
+        total: total amount of work. None: unknown, so the remaining time is not shown.
     """
     columns: tuple[ProgressColumn, ...] = (
         TextColumn("{task.description}", style="bold", markup=False),
@@ -122,7 +124,7 @@ def progress_bar(label: str, total: int | None) -> Iterator[Callable[[float, str
 
 
 def told_progress(label: str, items: Sequence[Item]) -> Iterator[Item]:
-    """The items, one by one, beside a bar that says how many are done."""
+    """Yield the items and show a progress bar with the number of finished ones."""
     with progress_bar(label, len(items)) as update:
         for done, item in enumerate(items):
             update(done, "")
@@ -130,19 +132,20 @@ def told_progress(label: str, items: Sequence[Item]) -> Iterator[Item]:
 
 
 def refuse_many(items: Sequence[object], most: int, what: str, advice: str) -> None:
-    """
+    """Check the number of episodes.
+
     Raises:
-        ConfigError: more episodes than a command takes at once.
+        ConfigError: there are more episodes than a command accepts.
     """
     if len(items) > most:
         raise ConfigError(f"{len(items)} episodes are given. {what} {most} at most. {advice}.")
 
 
 def writes(suffix: str | None = None) -> Callable[[Command], Command]:
-    """Of a command with an option `--out`: no other process writes there while it runs.
+    """Decorate a command with an option `--out`, so that no other process writes to the output while it runs.
 
     Args:
-        suffix: of the file that it takes; None for a folder.
+        suffix: suffix of the output file. None: the output is a folder.
     """
 
     def decorate(command: Command) -> Command:
@@ -166,10 +169,10 @@ def writes(suffix: str | None = None) -> Callable[[Command], Command]:
 
 
 def with_suffix(path: Path, suffix: str, option: str = "--out") -> Path:
-    """The path of an output file with its suffix, which is added, and said, where it is missing.
+    """Return the path of an output file with its suffix. A missing suffix is added, with a warning.
 
     Raises:
-        ConfigError: another suffix, or a folder.
+        ConfigError: the path has another suffix, or is a folder.
     """
     if path.suffix == suffix and not path.is_dir():
         return path
@@ -182,7 +185,7 @@ def with_suffix(path: Path, suffix: str, option: str = "--out") -> Path:
 
 
 def assignments(items: list[str] | None, option: str) -> dict[str, float]:
-    """["stretching=40", ...] -> {"stretching": 40.0}."""
+    """Parse ["stretching=40", ...] to {"stretching": 40.0}."""
     values: dict[str, float] = {}
     for item in items or []:
         name, _, text = item.partition("=")
@@ -194,10 +197,10 @@ def assignments(items: list[str] | None, option: str) -> dict[str, float]:
 
 
 def duration_s(text: str, option: str) -> float:
-    """ "90", "60s", "3min" or "1h" -> seconds.
+    """Convert a duration ("90", "60s", "3min" or "1h") to seconds.
 
     Raises:
-        ConfigError: anything else, or no time at all.
+        ConfigError: the text has another form, or the duration is not positive.
     """
     match = re.fullmatch(r"\s*(\d+(?:\.\d*)?)\s*(s|min|h|)\s*", text)
     seconds = float(match[1]) * {"": 1, "s": 1, "min": 60, "h": 3600}[match[2]] if match else 0.0
@@ -210,10 +213,10 @@ def duration_s(text: str, option: str) -> float:
 
 
 def episode_files(paths: list[Path]) -> list[Path]:
-    """Episode files; a folder stands for every `.npz` in it, sorted.
+    """Return episode files. A folder stands for all its `.npz` files, sorted.
 
     Raises:
-        ConfigError: a folder without episodes, or two episodes of one name.
+        ConfigError: a folder has no episodes, or two episodes have the same name.
     """
     files: list[Path] = []
     for path in paths:

@@ -1,4 +1,4 @@
-"""Errors that a person is expected to read: what came, what is allowed, what to try."""
+"""Errors for the user. Each message says what was found, what is allowed, and what to try."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from difflib import get_close_matches
 
 
 class DiffCloudError(Exception):
-    """Base of every error raised on purpose; commands print its message and exit with status 1."""
+    """Base of all intentional errors. Commands print the message and exit with status 1."""
 
 
 class MeshError(DiffCloudError):
@@ -15,7 +15,7 @@ class MeshError(DiffCloudError):
 
 
 class SceneError(DiffCloudError):
-    """A scene or scenario description that is wrong or asks for something unsupported."""
+    """A scene or scenario description is invalid, or needs something unsupported."""
 
 
 class EpisodeError(DiffCloudError):
@@ -31,11 +31,11 @@ class HardwareError(DiffCloudError):
 
 
 class LimitError(HardwareError):
-    """A motion that would leave, or has left, what the person allowed: box, speed, acceleration, wrench."""
+    """A motion would exceed, or has exceeded, a limit that the user set: box, speed, acceleration, wrench."""
 
 
 class UnconfirmedStopError(HardwareError):
-    """The arm has not confirmed Stop: it may still be moving."""
+    """The arm has not confirmed Stop. It may still be moving."""
 
 
 class CalibrationError(DiffCloudError):
@@ -47,7 +47,7 @@ class RobotError(DiffCloudError):
 
 
 class DatasetError(DiffCloudError):
-    """A simulated set that is missing, damaged, or does not fit together."""
+    """A simulated set is missing, damaged, or inconsistent."""
 
 
 class ConfigError(DiffCloudError):
@@ -59,15 +59,15 @@ class CheckpointError(DiffCloudError):
 
 
 class TrainingError(DiffCloudError):
-    """A training that cannot go on."""
+    """Training cannot continue."""
 
 
 class OutputError(DiffCloudError):
-    """A file that the system, or another process, keeps from being written."""
+    """A file cannot be written, because the system or another process prevents it."""
 
 
 class DivergedError(DiffCloudError):
-    """A rollout left the numbers: says which step, which batch entries, which parameters."""
+    """A simulation diverged to non-finite values. The message has the step, batch entries and parameters."""
 
     def __init__(self, step: int, entries: list[int], reason: str, parameters: str = "") -> None:
         self.step, self.entries, self.reason, self.parameters = step, entries, reason, parameters
@@ -80,7 +80,7 @@ class DivergedError(DiffCloudError):
 
 
 class UnresolvedContactError(DivergedError):
-    """Impacts of one step could not be resolved."""
+    """The impacts of a time step could not be resolved."""
 
     def __init__(self, step: int, entries: list[int], pair: str, passes: int) -> None:
         self.pair = pair
@@ -88,7 +88,7 @@ class UnresolvedContactError(DivergedError):
 
 
 def unknown_name(kind: str, name: object, allowed: Iterable[object]) -> str:
-    """The message for a name that is not in a closed set; with the one that was probably meant."""
+    """Return the message for a name that is not allowed, with the most similar allowed name."""
     names = sorted(map(str, allowed))
     near = get_close_matches(str(name), names, n=1)
     meant = f" Did you mean {near[0]!r}?" if near else ""

@@ -1,6 +1,6 @@
-"""The library, which `import diffcloud as dc` offers: from recordings to a fitted cloth, in SI units.
+"""Python interface (`import diffcloud as dc`): from recordings to a fitted cloth, in SI units.
 
-Commands do the same with files: `diffcloud fit` runs the same fit, from the same settings, as `fit` here.
+The command line does the same with files: `diffcloud fit` runs the same fit with the same settings as `fit`.
 """
 
 from __future__ import annotations
@@ -53,19 +53,19 @@ from diffcloud.simulators.export.write import described, write_export, write_sam
 
 @dataclass(frozen=True)
 class Estimate:
-    """What a fit says of one quantity."""
+    """Estimate of one quantity."""
 
     value: float
     unit: str
     interval: tuple[float, float] | None
-    """None: the solver knows no uncertainty."""
+    """(low, high). None if the solver does not estimate uncertainty."""
     level: float
-    """Probability of the interval."""
+    """Probability that the interval contains the value."""
     status: str
-    """`identified`, or why it is not; empty without an interval."""
+    """`identified`, or why it is not. Empty without an interval."""
     deviations: Mapping[str, float] = field(default_factory=dict)
-    """Source of uncertainty -> standard deviation, the largest first: of the logarithm, or of the part of the range where
-    the lower bound is zero."""
+    """Source of uncertainty -> standard deviation of the logarithm, largest first. If the lower bound of the quantity
+    is zero, standard deviations are fractions of its range instead."""
 
     def __str__(self) -> str:
         ends = "" if self.interval is None else f" ({self.interval[0]:.3g} to {self.interval[1]:.3g})"
@@ -75,49 +75,49 @@ class Estimate:
 
 @dataclass(frozen=True)
 class Scene:
-    """A cloth, what moves it, and what is around it."""
+    """A cloth, the motion of its handles, and its surroundings."""
 
     name: str
     options: Mapping[str, Any]
     """Fields of a YAML scenario (docs/scenarios.md)."""
     settings: FitSettings = field(default_factory=FitSettings)
-    """Of a fit, unless others are given."""
+    """Default settings of a fit in this scene."""
 
     @staticmethod
     def load(source: str | Path) -> Scene:
-        """A built-in scenario by its name, or a YAML file.
+        """Load a built-in scenario by its name, or a YAML file.
 
         Raises:
-            ConfigError, SceneError: unknown, or a file with something that cannot be.
+            ConfigError, SceneError: the scenario is unknown, or its file is invalid.
         """
         if not str(source).endswith((".yaml", ".yml")):
-            load_scenario(source)  # raises
+            load_scenario(source)  # only to check the name
             return Scene(str(source), {"base": str(source)})
         path = Path(source)
-        load_scenario(path)  # raises
+        load_scenario(path)  # only to check the file
         return Scene(path.stem, with_material_path(read_yaml(path, error=ConfigError) or {}, path.parent))
 
     @cached_property
     def scenario(self) -> Scenario:
-        """What the simulator and fits run."""
+        """The scenario for the simulator and fits."""
         if set(self.options) == {"base"}:
             return load_scenario(str(self.options["base"]))
         return make_scenario(own_options(self.options, self.name, f"scene {self.name}", folder=Path()))
 
     def simulate(self, quantities: Mapping[str, float | Tensor] | None = None, seconds: float | None = None) -> Rollout:
-        """The motion with other material than the scene's.
+        """Simulate the scene, optionally with other material parameters.
 
         Args:
-            quantities: such as {"stretching": 40.0} in SI units, numbers or tensors of shape [] or [B]; the motion is
-                differentiable in tensors. Names are those of `Fit.parameters`.
-            seconds: simulated; by default all of the scene's motion.
+            quantities: parameter values in SI units, such as {"stretching": 40.0}. Numbers, or tensors of shape [] or
+                [B], in which the motion is differentiable. Names are those of `Fit.parameters`.
+            seconds: duration. Default: the scene's whole motion.
 
         Returns:
             `positions` and `velocities` [B, S + 1, V, 3] in float64, [m] and [m/s], at `times` [S + 1] [s].
 
         Raises:
-            ConfigError: an unknown quantity, or more than one batch size.
-            DivergedError: names step and batch entries.
+            ConfigError: a quantity is unknown, or batch sizes differ.
+            DivergedError: the simulation diverged. The message has the step and batch entries.
         """
         scenario = self.scenario
         system, _ = scenario.scene.build()
@@ -134,30 +134,31 @@ class Scene:
 
 @dataclass(frozen=True)
 class Fit:
-    """A cloth that was fitted to one or several recordings."""
+    """Result of a fit to one or several recordings of a cloth."""
 
     parameters: Mapping[str, Estimate]
-    """Quantity -> what is known of it, in SI units."""
+    """Quantity -> estimate, in SI units."""
     status: str
-    """`fits_to_noise`, `model_error`, `not_converged`, `interrupted`, or `no_uncertainty` of a solver that knows none."""
+    """`fits_to_noise`, `model_error`, `not_converged`, `interrupted`, or `no_uncertainty` (not estimated by the
+    solver)."""
     residual: float
     """RMS distance between simulated and recorded points [m]."""
     horizons: Mapping[str, float]
-    """Recording -> time of the last frame that counted [s]; empty where the solver has no horizon."""
+    """Recording -> time of the last used frame [s]. Empty if the solver has no horizon."""
     scenes: Sequence[Scene]
-    """With the grasp that was found."""
+    """Scenes with the estimated grasp."""
     record: FitRecord
-    """All that is known, as `fit.json` has it."""
+    """The complete result, as in `fit.json`."""
     intervals: Intervals | None
     motions: Sequence[FittedMotion]
-    """Of each recording, with the fitted values."""
+    """Motion of each recording with the fitted values."""
 
     def __str__(self) -> str:
         lines = [f"{worded(self.status)}, residual {1e3 * self.residual:.1f} mm"]
         return "\n".join([*lines, *(f"{name}: {told}" for name, told in self.parameters.items())])
 
     def _repr_html_(self) -> str:
-        """A table of the parameters, for notebooks."""
+        """Return an HTML table of the parameters, for notebooks."""
         rows = [
             {
                 "parameter": name,
@@ -171,10 +172,10 @@ class Fit:
         return head + str(pd.DataFrame(rows).to_html(index=False))
 
     def sample(self, count: int, seed: int = 0) -> pd.DataFrame:
-        """Parameter sets drawn from the posterior: a row each, a column for each quantity in SI units.
+        """Sample parameter sets from the posterior: one row per set, one column per quantity in SI units.
 
         Raises:
-            ConfigError: there are no intervals, or the model does not follow the recordings.
+            ConfigError: there are no intervals, or the fit has a model error.
         """
         if self.intervals is None:
             raise ConfigError("Only a fit by the solver likelihood knows how uncertain it is; fit again with it.")
@@ -182,7 +183,7 @@ class Fit:
         return drawn * {name: entry.nominal for name, entry in self.intervals.parameters.items()}
 
     def save(self, folder: str | Path) -> Path:
-        """Write fit.json, fit.npz, intervals.json and scenes/, which `diffcloud export`, `view` and `simulate` read.
+        """Write fit.json, fit.npz, intervals.json and scenes/ for `diffcloud export`, `view` and `simulate`.
 
         Returns:
             The path of fit.json.
@@ -201,15 +202,15 @@ class Fit:
 def load_recording(
     path: str | Path, *, grippers: Mapping[str, str | Path] | None = None, rate_hz: float | None = None
 ) -> Episode:
-    """A recording from an episode file, or from a folder of numbered clouds.
+    """Load a recording from an episode file, or from a folder of numbered clouds.
 
     Args:
-        path: `.npz`, or a folder of `.npy`, `.ply`, `.xyz` or `.pcd` files in metres, z up.
-        grippers: of a folder, name -> CSV with the columns t_s, x, y, z; by default its gripper.csv.
-        rate_hz: of a folder, where neither the CSV nor the file names have times.
+        path: `.npz` file, or folder of `.npy`, `.ply`, `.xyz` or `.pcd` files in metres, z up.
+        grippers: for a folder: gripper name -> CSV file with columns t_s, x, y, z. Default: its gripper.csv.
+        rate_hz: for a folder: frame rate, if neither the CSV nor the file names have times.
 
     Raises:
-        EpisodeError: missing or damaged; what other recordings need is said.
+        EpisodeError: the recording is missing or damaged. The message explains how to import other recordings.
     """
     path = Path(path)
     if path.is_file():
@@ -233,15 +234,16 @@ def find_scenes(
     density: float | tuple[float, float] | None = None,
     grip: float | None = None,
 ) -> list[Scene]:
-    """A scene for each recording of one rectangular cloth, which lies flat at first or hangs from the gripper.
+    """Build a scene for each recording of a rectangular cloth, which first lies flat or hangs from the gripper.
 
     Args:
-        size: sides [m]; by default as the first frames show them.
-        density: weighed mass over area [kg/m²], or that and its standard deviation; by default it is fitted.
-        grip: side of the gripper's pad [m]; by default 20 mm, and fits find it.
+        size: side lengths [m]. Default: estimated from the first frames.
+        density: mass per area [kg/m²] of the weighed cloth, or (value, standard deviation). Default: estimated by the
+            fit.
+        grip: side of the gripper's pad [m]. Default: 20 mm, refined by the fit.
 
     Raises:
-        EpisodeError: a recording that shows something else; names the reason.
+        EpisodeError: a recording shows something else. The message has the reason.
     """
     weighed = None if density is None else density if isinstance(density, tuple) else (float(density), 0.0)
     fields = found_cloth(recordings, size, None if weighed is None else weighed[0])
@@ -274,16 +276,16 @@ def fit(
     *,
     progress: Callable[[Progress], None] | None = None,
 ) -> Fit:
-    """Estimate the parameters of one cloth from one or several recordings. Ctrl-C returns the best so far.
+    """Estimate the parameters of one cloth from one or several recordings. Ctrl-C returns the best result so far.
 
     Args:
         scenes: one for each recording.
-        settings: by default those of the first scene.
-        progress: told after each step.
+        settings: Default: those of the first scene.
+        progress: called after each step.
 
     Raises:
-        ConfigError, EpisodeError: what does not belong together; names it.
-        DivergedError: the motion diverges from every start.
+        ConfigError, EpisodeError: recordings, scenes and settings are inconsistent.
+        DivergedError: the simulation diverges from every start.
         KeyboardInterrupt: Ctrl-C before the first step.
     """
     episodes = [recordings] if isinstance(recordings, Episode) else list(recordings)
@@ -349,11 +351,11 @@ def _status(record: FitRecord, intervals: Intervals | None) -> str:
 
 
 def report(fit: Fit, recordings: Episode | Sequence[Episode], path: str | Path) -> Path:
-    """Write the page of a fit: findings, intervals, and a player of recorded clouds and fitted cloths.
+    """Write the HTML report of a fit: findings, intervals, and a player of recorded clouds and fitted cloths.
 
     Args:
-        recordings: of the fit, in its order.
-        path: of the HTML file.
+        recordings: the recordings of the fit, in the same order.
+        path: HTML file to write.
 
     Returns:
         The path.
@@ -374,20 +376,20 @@ def report(fit: Fit, recordings: Episode | Sequence[Episode], path: str | Path) 
 
 
 def export(fit: Fit, to: str, out: str | Path, *, recording: int = 0, samples: int = 0, seed: int = 0) -> Path:
-    """Write the fitted cloth for another simulator: mesh, material in SI units, and the motion of what is held.
+    """Export the fitted cloth to another simulator: mesh, material in SI units, and the motion of the grasped nodes.
 
     Args:
         to: mujoco, newton, isaac, arcsim, or obj.
-        out: folder; files that are there stay.
-        recording: whose motion is exported.
-        samples: further cloths, drawn as `Fit.sample` does, in `sample_0000` and so on.
+        out: folder. Other files in it are kept.
+        recording: index of the recording whose motion is exported.
+        samples: number of additional cloths from the posterior (`Fit.sample`), in `sample_0000` and so on.
 
     Returns:
         The folder.
 
     Raises:
-        SceneError: what the target cannot say.
-        ConfigError: samples of a fit without intervals.
+        SceneError: the target simulator does not support something in the scene.
+        ConfigError: samples are requested, but the fit has no intervals.
     """
     out, one, scenario = Path(out), fit.record.episodes[recording], fit.scenes[recording].scenario
     motion, values, drawn = fit.motions[recording], fit.record.values, list[dict[str, float]]()
@@ -402,12 +404,12 @@ def export(fit: Fit, to: str, out: str | Path, *, recording: int = 0, samples: i
 
 
 def sample_surface(nodes: Tensor, faces: Any, count: int, *, seed: int = 0) -> Tensor:
-    """Points on a surface, uniform by area of the first mesh; differentiable in the nodes.
+    """Sample points on a surface, uniformly by area of the first mesh in the batch. Differentiable in the nodes.
 
     Args:
         nodes: [..., V, 3]
         faces: [F, 3]
-        seed: the same one gives the same places on the surface.
+        seed: the same seed gives the same positions on the surface.
 
     Returns:
         [..., count, 3]
@@ -418,12 +420,13 @@ def sample_surface(nodes: Tensor, faces: Any, count: int, *, seed: int = 0) -> T
 
 
 def chamfer(points: Tensor, target: Any) -> Tensor:
-    """Mean squared distance from points to their nearest recorded ones (the paper's one-sided Chamfer distance);
-    differentiable in the points.
+    """Mean squared distance from points to the nearest recorded points (the paper's one-sided Chamfer distance).
+
+    The result is differentiable in the points.
 
     Args:
         points: [..., N, 3] [m]
-        target: [M, 3] recorded [m]
+        target: [M, 3] recorded points [m]
 
     Returns:
         [...] [m²]

@@ -1,9 +1,9 @@
-"""Kernels that are compiled once, to be linked into whatever calls them.
+"""Kernels that numba compiles once and links into their callers.
 
-numba makes every function that it compiles ready to run: with machine code of it and of all that it calls, and with a
-wrapper that takes Python's arguments apart. Almost all kernels are called by kernels only and need neither; and what is
-linked has been optimised already. Leaving all that out halves the time of compilation, and motions take as long as before.
-Nor do kernels count references to their arguments.
+By default, numba makes each compiled function callable on its own: with machine code of all functions that it calls,
+and with a wrapper for Python arguments. Most kernels are only called by other kernels, and need neither. Linked code is
+already optimised, and not optimised again. This halves the compilation time; simulations are as fast as before. Kernels
+also do not count references to their arguments.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ from numba.core.registry import CPUDispatcher
 from numba.core.typed_passes import NativeLowering
 
 _LARGE = 8
-"""A kernel with more kernels below it is not optimised together with them: they are, each with what it calls."""
+"""A kernel that calls more kernels than this is not optimised with them, since each is optimised already."""
 
 
 class LinkedKernel(CPUDispatcher):
-    """What kernels call. Python calls it too, through an entry of its own that numba keeps in its cache."""
+    """A kernel that other kernels call. For calls from Python, it has a separate entry function in numba's cache."""
 
     def __init__(self, function: Callable[..., Any], **options: Any) -> None:
         super().__init__(
@@ -41,12 +41,12 @@ class LinkedKernel(CPUDispatcher):
         return self._entry(*given, **named)
 
     def add_overload(self, compiled: Any) -> None:
-        """Without telling numba's table of what Python can call."""
+        """Add a compiled overload without registering it for calls from Python."""
         self.overloads[tuple(compiled.signature.args)] = compiled
 
 
 def _calling(linked: LinkedKernel, function: Callable[..., Any]) -> Callable[..., Any]:
-    """A function that does nothing but call a kernel, and that stands, for numba's cache, where the kernel's stands."""
+    """Create an entry function that only calls the kernel. numba's cache sees it at the kernel's source location."""
     name, parameters = function.__name__, inspect.signature(function).parameters.values()
     taken = ", ".join(one.name if one.default is one.empty else f"{one.name}={one.default!r}" for one in parameters)
     source = f"def {name}({taken}):\n    return linked({', '.join(one.name for one in parameters)})"
@@ -58,7 +58,7 @@ def _calling(linked: LinkedKernel, function: Callable[..., Any]) -> Callable[...
 
 
 class _Library(JITCodeLibrary):
-    """The code of a kernel and of all that it calls."""
+    """Code of a kernel and of all functions that it calls."""
 
     def _optimize_final_module(self) -> None:
         large = len(_below(self)) > _LARGE
@@ -68,7 +68,7 @@ class _Library(JITCodeLibrary):
 
 
 class _LinkedLibrary(_Library):
-    """That never runs by itself."""
+    """A library that is only linked into others and never executed by itself."""
 
     def _finalize_final_module(self) -> None:
         self._finalize_dynamic_globals()
@@ -76,7 +76,7 @@ class _LinkedLibrary(_Library):
 
 
 def _below(library: JITCodeLibrary) -> set[JITCodeLibrary]:
-    """The kernels that are linked into a library."""
+    """All kernels that are linked into a library, directly or indirectly."""
     found: set[JITCodeLibrary] = set()
     for one in library._linking_libraries:
         if isinstance(one, _LinkedLibrary) and one not in found:
@@ -85,8 +85,10 @@ def _below(library: JITCodeLibrary) -> set[JITCodeLibrary]:
 
 
 class _Borrowing(Lower):
-    """That takes no references to what a function is given: its caller holds one until it returns. Kernels are small and
-    many, and counting references takes a fifth of their time."""
+    """Lowering that takes no references to arguments, since the caller holds them until the function returns.
+
+    Kernels are small and numerous; counting references would take a fifth of their time.
+    """
 
     def pre_lower(self) -> None:
         super().pre_lower()
@@ -102,7 +104,7 @@ class _Borrowing(Lower):
     def lower_assign(self, kind: Any, statement: Any) -> Any:
         found = super().lower_assign(kind, statement)
         if statement.target.name in self._borrowed:
-            self.decref(kind, found)  # numba removes both
+            self.decref(kind, found)  # numba then removes the incref together with this decref
         return found
 
     def delvar(self, name: str) -> None:
@@ -119,7 +121,7 @@ class _LinkedLowering(NativeLowering):
         state.library = _LinkedLibrary(state.targetctx.codegen(), state.func_id.func_qualname)
         state.flags.no_compile = True
         super().run_pass(state)
-        state.cr = state.cr._replace(cfunc=object())  # by which numba finds it for callers
+        state.cr = state.cr._replace(cfunc=object())  # the key by which callers find this function
         state.targetctx.insert_user_function(state.cr.cfunc, state.cr.fndesc, [state.library])
         return True
 
@@ -145,7 +147,7 @@ class _EntryCompiler(CompilerBase):
 
 
 def _pipeline(state: Any, lowering: type[NativeLowering]) -> PassManager:
-    """numba's, with other libraries."""
+    """numba's default pipeline with another lowering pass."""
     manager = DefaultPassBuilder.define_nopython_pipeline(state)
     manager.passes = [(lowering if one is NativeLowering else one, why) for one, why in manager.passes]
     manager.finalize()

@@ -1,4 +1,4 @@
-"""Parse what people state of uncertainty: factors such as 1.5x, and standard deviations such as x=2cm,yaw=5deg."""
+"""Parse uncertainties on the command line: factors such as 1.5x, and standard deviations such as x=2cm,yaw=5deg."""
 
 from __future__ import annotations
 
@@ -14,15 +14,16 @@ _EXAMPLES = {"m": "2cm", "rad": "5deg", "s": "50ms", "1": "2%"}
 
 
 def parse_factor(text: str, told: str, example: str, *, most: float, instead: str) -> float:
-    """Of "1.5x".
+    """Parse a factor such as "1.5x".
 
     Args:
-        told: what it is of, with which the message begins.
-        example: a right one, with its parameter.
-        most: the largest that means anything; and what to do instead of a larger one.
+        told: start of the error message, with the name of the quantity.
+        example: a valid example for the message.
+        most: largest allowed factor.
+        instead: what to do instead of a larger factor, for the message.
 
     Raises:
-        ConfigError: no factor above 1, or a larger one.
+        ConfigError: the text is not a factor above 1, or the factor is too large.
     """
     match = re.fullmatch(r"([0-9.eE+-]+)\s*x", text)
     try:
@@ -37,16 +38,16 @@ def parse_factor(text: str, told: str, example: str, *, most: float, instead: st
 
 
 def parse_deviations(text: str, option: str, units: Mapping[str, str]) -> dict[str, float]:
-    """What an option says of how far each variable may well be off zero -> name -> standard deviation [m, rad, s, 1].
+    """Parse standard deviations of variables: name -> standard deviation [m, rad, s, 1].
 
     Args:
-        text: "none", or as in "x=10cm,y=0.1,yaw=30deg,size=2%"; a length without a unit in m, a time in s. An angle names
-            its unit, since 30 may be meant in degrees and 0.5 in radians, and a share is in percent.
-        option: its name, for messages.
-        units: of each variable, m, rad, s or 1.
+        text: "none", or for example "x=10cm,y=0.1,yaw=30deg,size=2%". The default unit of lengths is m, of times s.
+            Angles need a unit, because 30 could be degrees and 0.5 radians. Fractions need a percent sign.
+        option: name of the option, for messages.
+        units: unit of each variable: m, rad, s or 1.
 
     Raises:
-        ConfigError: an unknown name or unit, a unit of something else, or what is no positive number; names it.
+        ConfigError: a name or unit is unknown, a unit does not fit its variable, or a value is not a positive number.
     """
     if text.strip() == "none":
         return {}

@@ -1,4 +1,4 @@
-"""What sections of settings are made of: types with their limits, and the base of every section."""
+"""Building blocks of settings: types with limits, and the base class of all sections."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ from diffcloud.io.schema import Checked, Component, Vector, explain
 
 _MOST, _FACTOR = 10_000_000, 1e6
 MOST_STARTS = 100
-"""Of a fit. A start takes seconds to minutes."""
+"""Largest number of starts of a fit. A start takes seconds to minutes."""
 Count = Annotated[int, Field(ge=1, le=_MOST)]
 CountOrNone = Annotated[int, Field(ge=0, le=_MOST)]
-"""Zero: there is none, or it is left out."""
+"""A number of items. 0: none, or the step is skipped."""
 Seed = Annotated[int, Field(ge=0, lt=2**63)]
 Level = Annotated[float, Field(ge=0.01, le=0.999)]
-"""A probability of intervals."""
+"""Probability of an interval."""
 Factor = Annotated[float, Field(gt=1, le=_FACTOR)]
-"""Within which something is known."""
+"""Standard deviation as a factor: a value is known within this factor."""
 Name = Annotated[str, Field(max_length=1000)]
-"""Of a thing, a file or a folder."""
+"""Name of an object, file or folder."""
 Pixels = Annotated[int, Field(ge=1, le=10_000)]
 Names = Annotated[list[Name], Field(min_length=1, max_length=10_000)]
 Bounds = tuple[Component, Component]
@@ -34,7 +34,7 @@ def check_bounds(name: str, bounds: Bounds) -> None:
 
 
 class Section(Checked):
-    """One section of params.yaml. The text below a field is its help."""
+    """Base of the sections of params.yaml. The docstring of a field is its help text."""
 
     model_config = ConfigDict(use_attribute_docstrings=True)
 
@@ -51,10 +51,10 @@ S = TypeVar("S", bound=Section)
 
 
 def updated(section: S, **options: object) -> S:
-    """The section with the options that were given (not None) in place.
+    """Return the section with the given options. Options that are None keep their value.
 
     Raises:
-        ConfigError: a value out of range.
+        ConfigError: a value is out of range.
     """
     given = {name: value for name, value in options.items() if value is not None}
     try:

@@ -1,4 +1,4 @@
-"""Simulated sets for the regressors: draws of parameters, and the runs that the simulator gives for them."""
+"""Simulated data sets for the regressors: sampled parameters, and the simulated motions."""
 
 from diffcloud.datasets.chunks import CHUNK, Replaced
 from diffcloud.datasets.draws import Draws, ParameterBox, ParameterDraws

@@ -1,4 +1,4 @@
-"""A chunk of runs: the unit of work. What it gives depends on nothing but the chunk, on one type of processor."""
+"""A chunk of runs, the unit of parallel work. Its result depends only on the chunk, for one type of processor."""
 
 from __future__ import annotations
 
@@ -17,9 +17,10 @@ from diffcloud.sim.properties import PARAMETERS
 from diffcloud.sim.simulate import rollout
 
 CHUNK = 32
-"""Runs simulated together: where time per run stops falling for cloths of 50 to 80 nodes on a CPU (docs/datasets.md)."""
+"""Number of runs simulated together. Larger chunks are no faster per run for 50 to 80 nodes on a CPU
+(docs/datasets.md)."""
 _ATTEMPTS = 20
-"""Draws of one run that may diverge."""
+"""Largest number of parameter samples for a run that diverges."""
 
 
 @dataclass(frozen=True)
@@ -29,7 +30,7 @@ class Chunk:
     split: Split
     start: int
     parameters: NDArray[np.float64]
-    """[C, k] as first drawn."""
+    """[C, k] initial parameter samples."""
 
     @property
     def name(self) -> str:
@@ -38,7 +39,7 @@ class Chunk:
 
 @dataclass(frozen=True)
 class Replaced:
-    """A draw whose simulation diverged."""
+    """A parameter sample whose simulation diverged."""
 
     run: int
     attempt: int
@@ -49,26 +50,26 @@ class Replaced:
 
 @dataclass(frozen=True)
 class SimulatedChunk:
-    """What a chunk gives."""
+    """Result of a chunk."""
 
     parameters: NDArray[np.float64]
-    """[C, k] that were simulated in the end."""
+    """[C, k] final parameters, after diverged samples were replaced."""
     nodes: NDArray[np.float32]
-    """[C, T+1, V, 3] at each frame."""
+    """[C, T+1, V, 3] node positions at each frame."""
     replaced: tuple[Replaced, ...]
 
 
 def chunks_of(draws: ParameterDraws, split: Split, count: int) -> list[Chunk]:
-    """The chunks of a split's runs."""
+    """Split the runs of a split into chunks."""
     parameters = draws.first(split, count)
     return [Chunk(split, start, parameters[start : start + CHUNK]) for start in range(0, count, CHUNK)]
 
 
 def simulate_chunk(scenario: Scenario, draws: ParameterDraws, chunk: Chunk) -> SimulatedChunk:
-    """Simulate a chunk, and after it, as a batch of their own, draws in the place of those that diverged.
+    """Simulate a chunk. Runs that diverge are simulated again with new parameters, as a separate batch.
 
     Raises:
-        DatasetError: a run diverged with 20 draws.
+        DatasetError: a run diverged with all of its 20 parameter samples.
     """
     parameters = chunk.parameters.copy()
     nodes = np.empty((len(parameters), scenario.frames + 1, len(scenario.scene.mesh.nodes), 3), dtype=np.float32)
@@ -100,7 +101,7 @@ def simulate_chunk(scenario: Scenario, draws: ParameterDraws, chunk: Chunk) -> S
 def _nodes(
     scenario: Scenario, values: Mapping[str, NDArray[np.float64]]
 ) -> tuple[NDArray[np.float32], Mapping[int, DivergedError]]:
-    """Nodes [b, T+1, V, 3] of runs with parameters name -> [b], and those that diverged."""
+    """Simulate runs with parameters name -> [b]. Return nodes [b, T+1, V, 3], and the errors of diverged runs."""
     system, _ = scenario.scene.build()
     properties = scenario.properties(system, {name: torch.as_tensor(value) for name, value in values.items()})
     with torch.no_grad():

@@ -1,7 +1,7 @@
-"""Parameters of simulated runs: uniform, uniform in the logarithms, by a Sobol sequence, or as published.
+"""Sample parameters of simulated runs: uniform, log-uniform, Sobol sequence, or the published mixture.
 
-The published code picks a mode for each run (soft, medium, stiff, random) and then stretching and density uniformly in
-the mode's ranges. Draws outside of the bounds are rejected.
+For each run, the published code selects a mode (soft, medium, stiff, random), and then samples stretching and density
+uniformly in the ranges of this mode. Samples out of bounds are rejected.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ Draws = Literal["uniform", "sobol", "logarithmic", "modes"]
 
 _MIXED = ("stretching", "density")
 _TRIES = 64
-"""Draws from the modes of which the first inside the bounds counts; more than half of the published ones are."""
+"""Number of candidate samples per run. The first one inside the bounds is used; more than half are inside."""
 
 Range = tuple[float, float]
 Mode = tuple[tuple[Range, ...], tuple[Range, ...]]
-"""Ranges of stretching and of density; of two, each is as likely."""
+"""Ranges of stretching and of density. If there are two ranges, both are equally likely."""
 
 _SOFT, _MEDIUM, _STIFF = (0.1, 1.0), (1.0, 10.0), (1.0, 10.0)
 _STANDARD: tuple[Mode, ...] = (
@@ -57,25 +57,26 @@ MODES: dict[str, tuple[Mode, ...]] = {
     "vest_hang": _STANDARD,
     "release_hang": _STANDARD,
 }
-"""Scenario -> soft, medium, stiff, random."""
+"""Scenario -> modes: soft, medium, stiff, random."""
 
 
 @dataclass(frozen=True)
 class ParameterBox:
-    """Named parameters and their bounds."""
+    """Names of parameters and their bounds."""
 
     names: tuple[str, ...]
     bounds: NDArray[np.float64]
-    """[k, 2]"""
+    """[k, 2] lower and upper bound of each parameter."""
 
     @staticmethod
     def build(names: Sequence[str], bounds: Mapping[str, Range] | None = None) -> ParameterBox:
-        """
+        """Build the box from parameter names.
+
         Args:
-            bounds: a scenario's overrides of the parameters' own bounds.
+            bounds: bounds of the scenario, which replace the default bounds of parameters.
 
         Raises:
-            ConfigError: no parameter, an unknown one, or one listed twice.
+            ConfigError: there is no parameter, or one is unknown or listed twice.
         """
         for name in names:
             if name not in PARAMETERS:
@@ -88,37 +89,38 @@ class ParameterBox:
         return ParameterBox(tuple(names), np.array([{**own, **(bounds or {})}[name] for name in names]))
 
     def uniform(self, rng: np.random.Generator, count: int) -> NDArray[np.float64]:
-        """[count, k]; a longer draw begins with a shorter one."""
+        """Sample [count, k] uniformly. A larger count gives the same first rows."""
         low, high = self.bounds.T
         return rng.uniform(low, high, (count, len(self.names)))
 
     def sobol(self, rng: np.random.Generator, count: int) -> NDArray[np.float64]:
-        """[count, k] of a scrambled Sobol sequence."""
-        from scipy.stats import qmc  # takes as long to import as all of scipy else
+        """Return [count, k] points of a scrambled Sobol sequence."""
+        from scipy.stats import qmc  # slow to import
 
         low, high = self.bounds.T
         points = qmc.Sobol(len(self.names), rng=rng).random_base2(math.ceil(math.log2(max(count, 1))))[:count]
         return np.asarray(low + (high - low) * points)
 
     def logarithmic(self, rng: np.random.Generator, count: int) -> NDArray[np.float64]:
-        """[count, k] uniform in the logarithms: as many from 0.1 to 0.2 as from 5 to 10, which suits regressors that are
-        measured by relative errors. A parameter whose bounds begin at zero is drawn uniformly, as fits do with their
-        starts. A longer draw begins with a shorter one.
+        """Sample [count, k] uniformly in the logarithms. A larger count gives the same first rows.
+
+        There are then as many samples from 0.1 to 0.2 as from 5 to 10, as needed for regressors with relative errors.
+        Parameters whose lower bound is zero are sampled uniformly, as for starts of fits.
         """
         low, high = self.bounds.T
         fraction = rng.random((count, len(self.names)))
         safe = np.where(low > 0, low, 1.0)
         drawn = np.where(low > 0, safe * (high / safe) ** fraction, low + (high - low) * fraction)
-        return np.clip(drawn, low, high)  # which rounding may have left
+        return np.clip(drawn, low, high)  # rounding may have exceeded the bounds
 
     def mixture(self, modes: Sequence[Mode], rng: np.random.Generator, count: int) -> NDArray[np.float64]:
-        """[count, 2] of the modes, inside the bounds; a longer draw begins with a shorter one.
+        """Sample [count, 2] from a mixture of modes, within the bounds. A larger count gives the same first rows.
 
         Raises:
-            ConfigError: the modes hardly reach into the bounds.
+            ConfigError: the modes hardly overlap with the bounds.
         """
         ranges = np.array([[(of[0], of[-1]) for of in mode] for mode in modes])  # [M, 2, 2, low and high]
-        drawn = rng.random((count, _TRIES, 5))  # a mode, a range of each parameter, a place in each range
+        drawn = rng.random((count, _TRIES, 5))  # for the mode, the range of each parameter, and the value in each range
         mode = (drawn[..., 0] * len(modes)).astype(int)
         which = (drawn[..., 1:3] * ranges.shape[2]).astype(int)
         low, high = np.moveaxis(ranges[mode[..., None], np.arange(2), which], -1, 0)  # each [count, tries, 2]
@@ -131,10 +133,10 @@ class ParameterBox:
 
 @dataclass(frozen=True)
 class ParameterDraws:
-    """Which parameters the runs of a set get.
+    """Sampling of the parameters of a set's runs.
 
     Raises:
-        ConfigError: modes for what the published code has none for; uncertain material that is drawn.
+        ConfigError: there are no published modes for the scenario or parameters, or a nuisance parameter is also sampled.
     """
 
     box: ParameterBox
@@ -158,11 +160,11 @@ class ParameterDraws:
             )
 
     def first(self, split: Split, count: int) -> NDArray[np.float64]:
-        """[count, k] parameters of a split's runs."""
+        """Return initial parameters [count, k] of a split's runs."""
         return self._draw(np.random.default_rng([self.seed, SPLITS.index(split)]), count, self.kind)
 
     def again(self, split: Split, run: int, attempt: int) -> NDArray[np.float64]:
-        """[k] instead of those that diverged at attempts 0 to attempt - 1. A replaced Sobol point is drawn uniformly."""
+        """Return new parameters [k] for a run that diverged `attempt` times. Sobol points become uniform samples."""
         kind: Draws = "uniform" if self.kind == "sobol" else self.kind
         return self._draw(np.random.default_rng([self.seed, SPLITS.index(split), run, attempt]), 1, kind)[0]
 

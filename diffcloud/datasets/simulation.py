@@ -1,4 +1,4 @@
-"""A whole simulated set: draw, simulate chunk by chunk, join, write."""
+"""Simulate a whole set: sample parameters, simulate them in chunks, join and write the results."""
 
 from __future__ import annotations
 
@@ -30,16 +30,16 @@ _WORKER_MEMORY = {
     "distributed.nanny.pre-spawn-environ.MALLOC_TRIM_THRESHOLD_": str(1 << 30),
     "distributed.nanny.pre-spawn-environ.MALLOC_MMAP_THRESHOLD_": str(1 << 25),
 }
-"""Dask's settings, by which its processes keep memory that they freed. By default they give it back after 64 KiB, and a
-quarter of the time goes into getting it again."""
+"""Dask settings that let worker processes keep freed memory. By default they return blocks above 64 KiB to the system,
+and spend a quarter of the time on allocating them again."""
 
 
 @dataclass(frozen=True)
 class SimulationPlan:
-    """Everything that decides a set's bytes, on one type of processor.
+    """Everything that determines the contents of a set, for one type of processor.
 
     Raises:
-        ConfigError: no runs.
+        ConfigError: there are no runs.
     """
 
     scenario: Scenario
@@ -53,15 +53,15 @@ class SimulationPlan:
 
 @dataclass(frozen=True)
 class SimulationOutcome:
-    """What happened."""
+    """Summary of a call of `simulate_set`."""
 
     resumed: int
-    """Runs that an earlier, interrupted call had finished."""
+    """Number of runs that an earlier, interrupted call had finished."""
     replaced: dict[Split, list[Replaced]]
     discarded: bool
-    """Whether the chunks of another plan lay there and were thrown away."""
+    """Whether chunks of another plan were found and removed."""
     seconds: float
-    """Of this call."""
+    """Wall time of this call [s]."""
 
 
 def simulate_set(
@@ -73,20 +73,21 @@ def simulate_set(
     clouds: int | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> SimulationOutcome:
-    """Simulate a set into a folder, where it appears when it is whole, with its wall time beside it (`io.timings`).
+    """Simulate a set into a folder. The set is written when it is complete, with its wall time beside it
+    (`io.timings`).
 
-    Finished chunks are kept in `<out>.partial` and used by the next call with the same plan.
+    Finished chunks are stored in `<out>.partial`, and reused by the next call with the same plan.
 
     Args:
-        workers: local processes with a thread each; 0: the threads of this one.
-        client: of a Dask scheduler, whose workers have this version of the package; instead of `workers`.
-        clouds: points of each exported cloud; None: none are exported.
+        workers: number of local processes with one thread each. 0: the threads of this process.
+        client: client of a Dask scheduler, whose workers need the same package version. It replaces `workers`.
+        clouds: number of points of each exported cloud. None: export no clouds.
         progress: called with the number of finished runs.
 
     Raises:
-        ConfigError: the folder holds something else.
-        DatasetError: a run diverges with every draw, or workers die.
-        DiffCloudError: the folder cannot be written.
+        ConfigError: the folder has other contents.
+        DatasetError: a run diverges with all samples, or workers died.
+        DiffCloudError: the folder is not writable.
     """
     began = time.perf_counter()
     chunks = [chunk for split, count in plan.counts.items() for chunk in chunks_of(plan.draws, split, count)]
@@ -110,7 +111,7 @@ def simulate_set(
     outcome = SimulationOutcome(resumed, replaced, work.discarded, time.perf_counter() - began)
 
     def write(folder: Path) -> list[str]:
-        # beside the set, not in it: the same draws have the same bytes, whatever they took
+        # Write it beside the set, because the set itself should have the same bytes in each run.
         write_timings(folder, outcome.seconds, resumed=resumed)
         return _write(folder, plan, results, clouds)
 
@@ -121,7 +122,7 @@ def simulate_set(
 def _simulated(
     plan: SimulationPlan, chunks: Sequence[Chunk], workers: int, client: Any
 ) -> Iterator[tuple[Chunk, SimulatedChunk]]:
-    """Chunks as they are finished."""
+    """Yield chunks with their results, in order of completion."""
     if not chunks:
         return
     if client is None and not workers:
@@ -136,7 +137,7 @@ def _simulated(
         futures = {client.submit(simulate_chunk, plan.scenario, plan.draws, chunk, pure=False): chunk for chunk in chunks}
         done = as_completed(futures, with_results=True)
         while True:
-            # workers that are gone make Dask raise errors of many kinds; those of a chunk are the project's own
+            # Dask raises many types of errors if workers are gone. Errors of a chunk itself are DiffCloudErrors.
             try:
                 future, result = next(done)
             except StopIteration:
@@ -151,8 +152,8 @@ def _simulated(
 
 @contextmanager
 def _local_client(workers: int) -> Iterator[Any]:
-    """A Dask client of processes on this machine."""
-    import dask  # takes a second
+    """Yield a Dask client of processes on this machine."""
+    import dask  # slow to import
     from distributed import Client, LocalCluster
 
     with ExitStack() as stack:
@@ -161,13 +162,13 @@ def _local_client(workers: int) -> Iterator[Any]:
                 cluster = LocalCluster(
                     n_workers=workers,
                     threads_per_worker=1,
-                    dashboard_address=":0",  # any port: two sets at once do not quarrel
+                    dashboard_address=":0",  # any free port, so that two calls at once do not conflict
                     silence_logs=logging.CRITICAL,
                 )
             stack.enter_context(cluster)
             client = stack.enter_context(Client(cluster))
             client.run(_ignore_ctrl_c)
-        except Exception as error:  # a worker that dies while it starts
+        except Exception as error:  # a worker died during its start
             raise _workers_lost(error) from error
         yield client
 
@@ -180,7 +181,7 @@ def _workers_lost(error: Exception) -> DatasetError:
 
 
 def _ignore_ctrl_c() -> None:
-    """In a worker process: the terminal sends Ctrl-C to it too, but the process that started it tells it to stop."""
+    """Set up a worker: ignore Ctrl-C, because the parent process stops it, and use one thread."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     use_threads(1)
 
@@ -201,7 +202,7 @@ def _write(
     for split, simulated in sets.items():
         if clouds is None:
             break
-        seed = plan.draws.seed + SPLITS.index(split)  # the splits share no noise
+        seed = plan.draws.seed + SPLITS.index(split)  # different noise in both splits
         written = export_clouds(folder / "clouds" / split, simulated, points=clouds, seed=seed)
         names += [f"clouds/{split}/{name}" for name in written]
     return names + write_simulated(folder, sets, about=about, replaced=_replaced_table(plan, results))
@@ -240,15 +241,14 @@ def _replaced_table(plan: SimulationPlan, results: Mapping[Split, Sequence[Simul
 
 
 def export_clouds(folder: Path, simulated: SimulatedSet, *, points: int, seed: int) -> list[str]:
-    """Write the clouds of every run and frame as `<run>/<frame>.npy` float32 [points, 3], the layout of the published data;
-    return their names.
+    """Write the clouds of all runs and frames as `<run>/<frame>.npy` float32 [points, 3], and return the file names.
 
-    They are the first epoch's of a training that sees all frames of this set, with the same seed, number of points and the
-    default augmentation.
+    This is the folder layout of the published data. The clouds are those of the first training epoch with all frames,
+    the same seed and number of points, and default augmentation.
     """
     maker = CloudMaker.build(simulated, Augmentation(), points=points)
     names = []
-    for run, nodes in enumerate(simulated.nodes):  # one run's clouds are megabytes
+    for run, nodes in enumerate(simulated.nodes):  # one run at a time, because its clouds have megabytes
         clouds = maker.clouds(torch.as_tensor(nodes[None]), run_keys(seed, 0, torch.tensor([run])))[0].numpy()
         for frame, cloud in enumerate(clouds):
             names.append(f"{run}/{frame:03d}.npy")

@@ -1,7 +1,8 @@
-"""Chunks kept on disk while a set is simulated, so that an interrupted run goes on where it stopped.
+"""Store finished chunks on disk during a simulation, so that an interrupted run can be resumed.
 
-The work folder lies beside the output. It belongs to one plan: a fingerprint of everything that decides the numbers,
-including this package's source, says whether its chunks may be used. It lists its files, and only these are ever removed.
+The work folder is beside the output and belongs to one plan. A fingerprint of everything that affects the results,
+including source code, tells whether its chunks can be reused. The folder lists its files, and only these are ever
+removed.
 """
 
 from __future__ import annotations
@@ -24,30 +25,31 @@ from diffcloud.io.manifests import remove_files
 from diffcloud.io.simulated import LARGEST_BYTES, simulated_files
 
 _CODE = ("mesh", "sim", "scene", "datasets")
-"""Packages whose source decides the numbers."""
+"""Packages whose source code affects the results."""
 _ARRAYS = ("parameters", "nodes", "replaced")
 _PLAN = "plan.json"
 
 
 class WorkFolder:
-    """The chunks of one plan that are finished."""
+    """The folder of finished chunks of a plan."""
 
     def __init__(self, out: Path, plan: Any, chunks: Sequence[Chunk]) -> None:
-        """
+        """Open or create the work folder.
+
         Args:
-            out: the set's folder; the work folder is its sibling `<name>.partial`.
-            plan: what decides the numbers: dataclasses, mappings, sequences, arrays, numbers, strings.
-            chunks: all of the plan.
+            out: folder of the set. The work folder is its sibling `<name>.partial`.
+            plan: inputs of the results: dataclasses, mappings, sequences, arrays, numbers, strings.
+            chunks: all chunks of the plan.
 
         Raises:
-            ConfigError: the output or the work folder exists and is something else.
-            DiffCloudError: the folder cannot be written.
+            ConfigError: the output or work folder exists and has other contents.
+            DiffCloudError: the folder is not writable.
         """
         self.out = Path(out).absolute()
         self.path = self.out.with_name(f"{self.out.name}.partial")
         mark = fingerprint(plan, packages=_CODE)
         former = self._plan()
-        if former is None:  # else the output was looked at by the call that made the work folder
+        if former is None:  # otherwise the call that created the work folder has checked the output
             self._refuse_others()
         self.discarded = former is not None and former["fingerprint"] != mark
         if former is not None and self.discarded:
@@ -58,13 +60,13 @@ class WorkFolder:
         write_json(self.path / _PLAN, {"fingerprint": mark, "files": self._files, "replaces": replaced})
 
     def write(self, chunk: Chunk, result: SimulatedChunk) -> None:
-        """Keep a finished chunk."""
+        """Store a finished chunk."""
         replaced = np.array(json.dumps([asdict(entry) for entry in result.replaced]))
         arrays = {"parameters": result.parameters, "nodes": result.nodes, "replaced": replaced}
         write_npz(self._file(chunk), compressed=False, **arrays)
 
     def read(self, chunk: Chunk) -> SimulatedChunk | None:
-        """A finished chunk, None if it is missing or damaged."""
+        """Read a finished chunk. None if it is missing or damaged."""
         try:
             path, most = self._file(chunk), LARGEST_BYTES
             told = read_npz(path, kind="chunk of runs", error=DatasetError, names=_ARRAYS, most_bytes=most)
@@ -78,15 +80,16 @@ class WorkFolder:
             return None
 
     def publish(self, write: Callable[[Path], list[str]]) -> None:
-        """Let `write` write the set and name its files; remove what is left of a former one, and this work folder.
+        """Call `write`, which writes the set and returns file names. Then remove remains of an old set, and this
+        folder.
 
-        A kill at any moment leaves the former set, or none, and the chunks.
+        If the process is killed at any time, the old set or no set remains, and the chunks.
         """
         with together():
             written = write(self.out)
         remove_files(self.out, set(self._replaces) - set(written))
         remove_files(self.path, self._files)
-        with suppress(OSError):  # somebody else has put something there
+        with suppress(OSError):  # the folder has other files
             self.path.rmdir()
 
     def _refuse_others(self) -> None:
@@ -103,7 +106,7 @@ class WorkFolder:
         return self.path / f"{chunk.name}.npz"
 
     def _plan(self) -> dict[str, Any] | None:
-        """What the call that made the work folder has stated; None if there is none, or it is of something else."""
+        """Return the contents of the plan file. None if it is missing or invalid."""
         try:
             told = read_json(self.path / _PLAN, error=DatasetError)
         except DatasetError:

@@ -1,4 +1,4 @@
-"""Cameras and arm. Their own packages are imported when a device is opened, and never needed for anything else."""
+"""Cameras and arm. The packages of their makers are imported only when a device is opened."""
 
 from diffcloud.hardware.arm_limits import ArmLimits
 from diffcloud.hardware.arm_process import ArmProcess

@@ -1,12 +1,13 @@
-"""What an arm may do beyond its tool's point: joints, singularity, every link against table and surroundings, tool frame.
+"""Limits of the arm beyond the tool's position: joints, singularities, collisions of links, tool frame.
 
-A trajectory gives the tool's position; where elbow and wrist go follows from it. Before anything moves, the joints are
-predicted along the whole path: from the measured joint state, inverse kinematics step by step, the tool keeping its
-measured orientation, each step the shortest in joint space. An arm with more joints than it needs may resolve its freedom
-otherwise, so this is a forecast; what is measured while it moves is held against the same limits.
+A trajectory gives the tool's position only. So the joint angles along the whole path are predicted before the arm
+moves: inverse kinematics step by step from the measured state, with constant tool orientation and the smallest joint
+motion. A redundant arm may move differently, so the measured states are checked against the same limits during the
+motion.
 
-The tool frame that is configured on the arm is not read but compared: where the arm reports its tool must be where its
-joints and the description put it. That shows a wrong tool frame, a wrong description and a joint log of another arm alike.
+The tool frame configured on the arm cannot be read. Instead, the reported tool pose is compared with the forward
+kinematics of the robot description. A difference reveals a wrong tool frame, a wrong description, or the joint log of
+another arm.
 """
 
 from __future__ import annotations
@@ -24,48 +25,48 @@ from diffcloud.errors import LimitError, RobotError
 from diffcloud.hardware.devices import ArmReading
 from diffcloud.hardware.trajectory import Limits, ToolTrajectory
 
-if TYPE_CHECKING:  # brings torch, which the arm's own process, importing this package, neither needs nor waits for
+if TYPE_CHECKING:  # imports torch, which the arm's own process does not need and would have to wait for
     from diffcloud.sensing.robot import Robot
 
 Floats = NDArray[np.float64]
 
 _STEP_M = 0.005
-"""Between predicted poses of the tool."""
+"""Distance between predicted tool poses along a path."""
 _BASE_M = 0.1
-"""Half the width of the base, which stands at the origin."""
+"""Half the width of the arm's base, which is at the origin."""
 _ELBOW_M = 0.76
-"""Height of a Gen3's elbow when its upper arm points up [m]."""
+"""Height of a Gen3's elbow when its upper arm is vertical."""
 _SPEED_WINDOW_S = 0.4
-"""Joint speeds are measured over this long; a reading's moment is known to some 20 ms."""
+"""Time window for measuring joint speeds. The time of a reading is uncertain by about 20 ms."""
 _SPEED_SLACK = 1.1
-"""A measured joint may be this much faster than a planned one: it also corrects errors, and its speed is known to 5 %."""
+"""Factor by which a measured joint speed may exceed the limit, for error corrections and 5 % measurement error."""
 _NOISE = 2e-3
-"""m and rad: so much a motion that comes back into the limits may go outwards in between."""
+"""Tolerance [m, rad] for outward motion while the arm returns inside the limits."""
 _TABLE = 8
-"""Place of the table among the criteria of `ArmChecker.excess`: the third face of the links' space."""
+"""Index of the table among the criteria of `ArmChecker.excess` (the third face for links)."""
 
 
 @dataclass(frozen=True)
 class ArmLimits:
-    """What joints and links may do."""
+    """Limits of joints and links."""
 
     table_m: float = 0.0
-    """Height of the table in the base frame: no moving link may come below it [m]."""
+    """Height of the table in the base frame [m]. No moving link may be lower."""
     clearance_m: float = 0.01
-    """A planned path stays this much higher, and this much inside the arm's space."""
+    """Extra distance of a planned path from the table and from the walls of the links' space."""
     margin_m: float = 0.15
-    """Links may reach this far beyond the workspace box and the base: half a wrist, and fingers beyond the tool's point."""
+    """Distance by which links may extend beyond the workspace box and the base, for wrist and fingers."""
     joint_margin_rad: float = float(np.deg2rad(5.0))
-    """A planned path stays this far from the ends of the joints; a measured one, half as far."""
+    """Distance of a planned path from the joint limits. Measured joints may be half as far."""
     joint_speed_rad_s: float = 1.2
-    """The makers' limits are 1.22 (wrist) and 1.40."""
+    """Largest joint speed. The maker's limits are 1.22 (wrist) and 1.40."""
     singular_value: float = 0.05
-    """Least of the tool's Jacobian (metres and radians per radian). Nearer to a singularity, a small motion of the tool
-    needs a large one of the joints."""
+    """Smallest singular value of the tool's Jacobian [m/rad, rad/rad]. Closer to a singularity, small tool motions need
+    large joint motions."""
     turn_rad: float = float(np.deg2rad(5.0))
-    """The tool may turn by this much while it should keep its orientation."""
+    """Largest rotation of the tool from its orientation at the start."""
     tool_offset_m: float = 0.01
-    """Between the tool that the arm reports and the one that its joints and the description give."""
+    """Largest distance between the reported tool position and the forward kinematics."""
     tool_turn_rad: float = float(np.deg2rad(3.0))
 
     def __post_init__(self) -> None:
@@ -76,7 +77,7 @@ class ArmLimits:
 
 @dataclass(frozen=True)
 class JointPath:
-    """Joints over time, straight lines in joint space between the rows."""
+    """Path in joint space: straight lines between rows."""
 
     times: Floats
     """[T] since the start [s]."""
@@ -89,24 +90,23 @@ class JointPath:
 
     @property
     def fastest_rad_s(self) -> float:
-        """Of any joint at any time."""
+        """Highest speed of any joint at any time."""
         return float((np.abs(np.diff(self.joints_rad, axis=0)) / np.diff(self.times)[:, None]).max())
 
     def at(self, t_s: float) -> Floats:
-        """[J] the ends are held."""
+        """[J] joint angles at time `t_s`. Before the start and after the end, those at the ends."""
         return np.array([np.interp(t_s, self.times, column) for column in self.joints_rad.T])
 
 
 class ArmChecker:
-    """Holds planned and measured joint states against the limits.
+    """Checks planned and measured joint states against the limits.
 
     Args:
         robot: description of the arm with its gripper, in the arm's base frame.
-        limits: of the tool; the workspace box is also the core of the space that the links may use.
+        limits: limits of the tool. The links' space is the workspace box, enlarged by a margin.
 
     Raises:
-        LimitError: the description has no surfaces of links that move, or a joint of the arm without limits that is not
-            one that turns without end.
+        LimitError: no moving link has a mesh, or a joint of the arm has no limits and is not continuous.
     """
 
     def __init__(self, robot: Robot, limits: Limits, arm_limits: ArmLimits) -> None:
@@ -132,10 +132,10 @@ class ArmChecker:
         self._space[0, 2] = arm_limits.table_m
 
     def check_tool_frame(self, reading: ArmReading) -> None:
-        """Compare the reported tool with the one that joints and description give.
+        """Compare the reported tool pose with the forward kinematics of the robot description.
 
         Raises:
-            LimitError: they differ; says by how much, in the reported tool's frame, and what to look at.
+            LimitError: they differ. The message has the difference in the reported tool's frame, and hints.
         """
         if not np.isfinite([*reading.joints_rad, *reading.tool_position_m, *reading.tool_quaternion]).all():
             raise LimitError(f"The arm reports no numbers for its joints or its tool: {reading}.")
@@ -159,17 +159,18 @@ class ArmChecker:
             )
 
     def predict(self, reading: ArmReading, positions: Floats) -> tuple[Floats, str | None]:
-        """[T', J] joints that bring the tool from `reading` along `positions` [T, 3] [m], without turning it.
+        """Predict the joints [T', J] that move the tool from `reading` along `positions` [T, 3] [m] without rotation.
 
         Returns:
-            The joints up to the first position that is out of reach, and why that one is; None where all are reached.
+            Joints up to the first unreachable position, and the reason why it is unreachable (None if all are
+            reachable).
         """
         tool = self.robot.tool_pose(reading.joints_rad)
-        # the prediction is of the described arm, which may stand some millimetres beside the measured one
+        # The inverse kinematics is of the described arm, which may differ from the measured one by some millimetres.
         positions = positions + (tool[:3, 3] - reading.tool_position_m)
         joints = reading.joints_rad
         found: list[Floats] = []
-        for position in positions:  # each from the one before: the arm goes there in this order
+        for position in positions:  # in order, because each solution starts from the previous one
             try:
                 joints = self.robot.inverse_kinematics(position, rotations=tool[:3, :3], start_rad=joints)
             except RobotError as error:
@@ -178,17 +179,17 @@ class ArmChecker:
         return np.array(found), None
 
     def check_trajectory(self, name: str, trajectory: ToolTrajectory, reading: ArmReading) -> ArmReading:
-        """Refuse a trajectory that would break a limit on the way.
+        """Check that a trajectory stays within all limits.
 
         Args:
-            name: of the motion, for the message.
-            reading: of the arm at its start.
+            name: name of the motion, for messages.
+            reading: state of the arm at the start.
 
         Returns:
-            What the arm will measure at the end, to check what comes after.
+            Predicted reading at the end, from which the next motion can be checked.
 
         Raises:
-            LimitError: says when, which joint or link, and by how much.
+            LimitError: a limit is exceeded. The message has the time, the joint or link, and the excess.
         """
         times = _sample_times(trajectory)
         positions = np.array([trajectory.position(t) for t in times])
@@ -215,13 +216,13 @@ class ArmChecker:
         return ArmReading(joints[-1], positions[-1], reading.tool_quaternion, float(closed[-1]), reading.wrench)
 
     def plan_home(self, home_rad: Floats, reading: ArmReading, *, speed_m_s: float) -> JointPath:
-        """A straight minimum-jerk path in joint space, on which no point of the arm is faster than `speed_m_s`.
+        """Plan a straight minimum-jerk path in joint space on which no point of the arm exceeds `speed_m_s`.
 
-        It may begin outside the limits (a parked arm is folded beyond its joints' margins, and outside the box), but then
-        only comes back into them; the table is no such limit.
+        The path may start outside the limits, for example with folded joints or outside the box. It then may only
+        return into the limits. Contact with the table is never allowed.
 
         Raises:
-            LimitError: it would leave the limits, or leave them farther.
+            LimitError: the path would leave the limits, or move farther outside.
         """
         home = self._nearest(home_rad, reading.joints_rad)
         s = np.linspace(0.0, 1.0, 101)
@@ -229,34 +230,34 @@ class ArmChecker:
         closed = np.full(len(s), _known(reading.gripper))
         self._check("way home", s, joints, closed, self.robot.tool_pose(joints)[:, :3, 3], returning=True)
         steps = [np.linalg.norm(np.diff(points, axis=0), axis=-1).max() for points in self._points(joints, closed).values()]
-        path_m = float(max(steps)) / s[1]  # of the fastest point, had it its greatest speed all the way
+        path_m = float(max(steps)) / s[1]  # path length of the fastest point at its highest speed throughout
         turn = float(np.abs(home - reading.joints_rad).max())
-        # 15/8: peak over mean speed of minimum jerk
+        # 15/8 is the ratio of peak to mean speed of a minimum-jerk motion.
         duration = max(1.875 * path_m / speed_m_s, 1.875 * turn / self.arm_limits.joint_speed_rad_s, 0.5)
         eased = s**3 * (10 - 15 * s + 6 * s**2)
         return JointPath(s * duration, reading.joints_rad + eased[:, None] * (home - reading.joints_rad))
 
     def at(self, joints_rad: Floats, reading: ArmReading) -> ArmReading:
-        """What the arm will measure with joints [J], if all else stays as in `reading`."""
+        """Predicted reading with joints [J], if everything else stays as in `reading`."""
         tool = self.robot.tool_pose(joints_rad)
         quaternion = Rotation.from_matrix(tool[:3, :3]).as_quat(scalar_first=True)
         return ArmReading(joints_rad, tool[:3, 3], quaternion, reading.gripper, reading.wrench)
 
     def watch(self, name: str, start: ArmReading, *, returning: bool = False) -> ArmWatch:
-        """Checks for the readings of one motion.
+        """Return a checker for the readings of one motion.
 
         Args:
-            returning: it may begin outside the limits, if it only comes back.
+            returning: the motion may start outside the limits, if it only returns into them.
         """
         return ArmWatch(self, name, start, returning=returning)
 
     def excess(self, joints_rad: Floats, gripper: Floats, positions: Floats, *, slack: float) -> Floats:
-        """[T, 12 + J] how far tool and links [m, six faces each] and joints [rad] are beyond their limits; negative inside.
+        """[T, 12 + J] excess over the limits of tool, links (6 faces each) [m] and joints [rad]. Negative is inside.
 
         Args:
-            gripper: [T] 0 open to 1 closed.
+            gripper: [T] from 0 (open) to 1 (closed).
             positions: [T, 3] of the tool [m].
-            slack: 0 for a planned path, 1 for a measured one, which may use the margins (half of a joint's).
+            slack: 0 for a planned path. 1 for a measured one, which may use the margins (for joints, half of them).
         """
         limits = self.arm_limits
         ends = self._kept_ends(slack)
@@ -271,11 +272,11 @@ class ArmChecker:
         return np.concatenate([tool, links, joint], axis=1)
 
     def _kept_ends(self, slack: float) -> Floats:
-        """[J, 2] of the joints, with the margins of `excess`."""
+        """[J, 2] joint limits, reduced by the margins of `excess`."""
         return self._ends + np.array([1.0, -1.0]) * self.arm_limits.joint_margin_rad * (1 - slack / 2)
 
     def describe(self, criterion: int, joints_rad: Floats, gripper: float, position: Floats) -> str:
-        """What is wrong at one state [J], where `excess` says that this criterion is exceeded."""
+        """Describe how one state [J] exceeds a criterion of `excess`."""
         face, joint = criterion - 6, criterion - 12
         if joint >= 0:
             low, high = np.rad2deg(self._ends[joint])
@@ -303,7 +304,7 @@ class ArmChecker:
         return f"{link} reaches {'xyz'[axis]} = {value:.3f} m; the arm's space ends at {bound:.3f} m"
 
     def singular_values(self, joints_rad: Floats) -> Floats:
-        """[...] least singular value of the tool's Jacobian at joints [..., J]."""
+        """[...] smallest singular value of the tool's Jacobian at joints [..., J]."""
         return np.asarray(np.linalg.svd(self.robot.jacobian(joints_rad), compute_uv=False)[..., -1], dtype=np.float64)
 
     def _check(
@@ -311,7 +312,7 @@ class ArmChecker:
     ) -> None:
         excess = self.excess(joints, gripper, positions, slack=0.0)
         allowed = np.zeros_like(excess)
-        if returning:  # beyond a limit by no more than the path was before; in the table no part of it may be
+        if returning:  # the excess may not grow along the path, and contact with the table is never allowed
             allowed = np.maximum(np.minimum.accumulate(excess, axis=0), 0.0) + _NOISE
             allowed[:, _TABLE] = np.minimum(allowed[:, _TABLE], self.arm_limits.clearance_m)
         bad = np.flatnonzero((excess > allowed + 1e-9).any(axis=1))
@@ -325,7 +326,7 @@ class ArmChecker:
                 "or move the trajectory. If the arm is free to go there, change table_height_m, link_margin_m or "
                 "workspace_m in rig.yaml."
             )
-        if returning:  # in joint space a singularity is a place like others
+        if returning:  # motion in joint space is not affected by singularities
             return
         values = self.singular_values(joints)
         if values.min() < self.arm_limits.singular_value:
@@ -338,8 +339,10 @@ class ArmChecker:
             )
 
     def _nearest(self, target_rad: Floats, joints_rad: Floats) -> Floats:
-        """[J] of each joint's target, the turn nearest to where the joint is that a planned path may go to; where there is
-        none, one between the joint's ends, or else any: `_check` refuses those."""
+        """[J] targets shifted by whole turns to the nearest value within the planned limits.
+
+        If there is none, the nearest value within the joint limits, else the nearest one. `_check` refuses these.
+        """
         nearest = np.round((joints_rad - target_rad) / (2 * np.pi))
         turns = nearest
         for ends in (self._ends, self._kept_ends(slack=0.0)):
@@ -349,7 +352,7 @@ class ArmChecker:
         return np.asarray(target_rad + 2 * np.pi * turns)
 
     def _points(self, joints_rad: Floats, gripper: Floats) -> dict[str, Floats]:
-        """[T, V, 3] corners of each link that moves [m]."""
+        """[T, V, 3] mesh vertices of each moving link [m]."""
         poses = self.robot.forward_kinematics(self.robot.configuration(joints_rad, gripper))
         placed = ((name, poses[:, self.robot.links.index(name)]) for name in self._moving)
         meshes = self.robot.description.meshes
@@ -359,35 +362,37 @@ class ArmChecker:
 
     @cached_property
     def _moving(self) -> tuple[str, ...]:
-        """Links with a surface that are not fixed to the base, which stands on the table."""
+        """Links with a mesh that are not fixed to the base, since the base touches the table."""
         description = self.robot.description
         fixed = {description.root}
-        for joint in description.joints:  # from the root outwards
+        for joint in description.joints:  # ordered from the root outwards
             if joint.kind == "fixed" and joint.parent in fixed:
                 fixed.add(joint.child)
         return tuple(name for name in description.meshes if name not in fixed)
 
 
 class ArmWatch:
-    """The readings of one motion against the limits."""
+    """Checks the readings of one motion against the limits."""
 
     def __init__(self, checker: ArmChecker, name: str, start: ArmReading, *, returning: bool) -> None:
         self._checker, self._name, self._returning = checker, name, returning
         self._orientation = _rotation(start)
         self._since: tuple[float, Floats] | None = None
-        """When the joints' speed was last measured, and their angles [J] then."""
+        """Time and joint angles [J] of the latest speed measurement."""
         self._allowed = np.zeros(len(start.joints_rad) + 12)
         if returning:
             self._allowed = np.maximum(self._excess(start), 0.0)
             self._allowed[_TABLE] = 0.0
 
     def check(self, t: float, reading: ArmReading) -> None:
-        """Raises:
-        LimitError: says which joint or link, and when.
+        """Check one reading.
+
+        Raises:
+            LimitError: a limit is exceeded. The message has the time and the joint or link.
         """
         checker, when = self._checker, f"At t = {t:.2f} s of the {self._name}"
         excess = self._excess(reading)
-        kept = excess <= self._allowed + (_NOISE if self._returning else 0.0)  # NaN is not kept
+        kept = excess <= self._allowed + (_NOISE if self._returning else 0.0)  # false for NaN
         if not kept.all():
             gripper = _known(reading.gripper)
             what = checker.describe(int(kept.argmin()), reading.joints_rad, gripper, reading.tool_position_m)
@@ -420,7 +425,7 @@ class ArmWatch:
         if t - before < _SPEED_WINDOW_S:
             return
         self._since = t, joints_rad
-        turned = (joints_rad - joints + np.pi) % (2 * np.pi) - np.pi  # a joint that turns without end may begin anew
+        turned = (joints_rad - joints + np.pi) % (2 * np.pi) - np.pi  # the angle of a continuous joint may wrap around
         speed = np.abs(turned) / (t - before)
         limit = _SPEED_SLACK * self._checker.arm_limits.joint_speed_rad_s
         if not speed.max() <= limit:
@@ -436,7 +441,7 @@ class ArmWatch:
 
 
 def _known(gripper: float | None) -> float:
-    """Not known is taken as open, when the fingers reach farthest."""
+    """Return the gripper state. If unknown, assume open, because open fingers extend farthest."""
     return 0.0 if gripper is None else gripper
 
 
@@ -445,7 +450,7 @@ def _rotation(reading: ArmReading) -> Rotation:
 
 
 def _sample_times(trajectory: ToolTrajectory) -> Floats:
-    """[T] the keyframes, and between them so many that the tool moves by no more than a step."""
+    """[T] times of the keyframes and of points between them, such that the tool moves at most `_STEP_M` in between."""
     lengths = np.linalg.norm(np.diff(trajectory.positions, axis=0), axis=1)
     counts = np.maximum(1, np.ceil(lengths / _STEP_M)).astype(int)
     pieces = [

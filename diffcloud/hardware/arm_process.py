@@ -1,26 +1,24 @@
-"""The arm in a process of its own, which stops it when the capture hangs, is suspended, or dies.
+"""The arm's connection in its own process, which stops the arm if the capture hangs, is suspended, or dies.
 
-A velocity keeps the arm moving until the next command, so somebody has to be there to send Stop. The capture cannot always
-be: it may be suspended (Ctrl-Z, SIGSTOP), killed, or stuck in a driver. So the connection belongs to a child process that
-does nothing else. It is in a session of its own, where a terminal's signals do not reach it, and treats every signal that
-can be caught as an order to stop the arm. It sends Stop by itself
+A velocity command is valid until the next command, so some process must be able to send Stop. The capture may be
+suspended (Ctrl-Z, SIGSTOP), killed, or blocked in a driver. So a child process owns the connection and does nothing
+else. It runs in its own session, so signals of the terminal do not reach it. Any catchable signal makes it stop the
+arm. It sends Stop
 
-- when nothing has been heard from the capture for `watchdog_s` while the arm moves,
-- when the socket to the capture ends, because that process has,
-- when the capture asks for it: `stop` waits for the arm's confirmation, `halt` does not wait and may be called from a
-  signal handler.
+- if the arm moves and the capture has sent nothing for `watchdog_s` (watchdog),
+- if the socket to the capture closes, because the capture has ended,
+- if the capture requests it. `stop` waits for confirmation. `halt` does not wait and is safe in a signal handler.
 
-A Stop that the arm does not confirm is repeated, then followed by the arm's emergency stop, shouted about, and repeated
-again. From any Stop on, velocities are refused until the next `prepare`; a velocity that was on its way when Stop was sent
-is followed by another Stop. So the last thing an arm hears after a Stop is never a velocity.
+If the arm does not confirm a Stop, the child repeats it, then applies the emergency stop, warns the user, and repeats
+again. After a Stop, velocities are refused until the next `prepare`. If a velocity command overlaps with a Stop, a
+second Stop follows. So the last command that the arm receives after a Stop is never a velocity.
 
-If the child itself is killed or suspended, or the cable is cut, nobody can send anything, and the arm's own connection
-timeout stops it (`kinova`). A child whose capture is gone and whose Stops are not confirmed ends after a few seconds for
-the same reason: while it lives, it keeps the connection alive.
+If the child itself is killed or suspended, or the cable is cut, the arm's own connection timeout stops it (`kinova`).
+This works only if the connection is not kept alive, so a child without a capture exits after a few seconds.
 
-The socket keeps message boundaries (SOCK_SEQPACKET), so a call that a signal interrupts leaves no half message behind. The
-child is started as a plain process, not through multiprocessing, which would import the caller's `__main__` (a script
-without a guard would start itself again) and would wait at exit for a child that ignores its SIGTERM.
+The socket keeps message boundaries (SOCK_SEQPACKET), so a signal cannot leave a partial message. The child is a plain
+subprocess. multiprocessing would import the caller's `__main__`, which would restart a script without a guard. It would
+also wait at exit for a child that ignores SIGTERM.
 """
 
 from __future__ import annotations
@@ -46,20 +44,20 @@ from diffcloud.hardware.devices import Arm, ArmReading, Floats
 from diffcloud.hardware.interruption import catchable_signals
 
 WATCHDOG_S = 0.5
-"""A control loop at 50 Hz misses 25 readings before it counts as hung."""
+"""Watchdog timeout: about 25 missed readings of the control loop."""
 
 _STOP_ATTEMPTS = 2
 _REPEAT_S = 0.2
-"""Between attempts at a Stop that the arm has not confirmed."""
+"""Time between attempts at a Stop that the arm has not confirmed."""
 _GIVE_UP_S = 3.0
-"""So long a child whose capture is gone tries to stop the arm."""
+"""Time for which the child tries to stop the arm after the capture has ended."""
 _IN_FLIGHT_S = 0.5
-"""A command that overlaps with a Stop is waited for this long, so that another Stop can follow it."""
+"""Time to wait for a command that overlaps with a Stop, before a second Stop is sent."""
 _LARGEST_MESSAGE = 1 << 16
 _OPEN_TIMEOUT_S = 60.0
 _CALL_TIMEOUT_S = 2.0
 _TIMEOUTS_S = {"prepare": 10.0, "stop": 2.5, "emergency_stop": 2.5}
-"""Of calls that may take longer: `prepare` waits for a transient state, a Stop may try more than once."""
+"""Timeouts of slower calls. `prepare` waits for a transient state, and a Stop may need several attempts."""
 _VELOCITIES = ("send_velocity", "send_joint_velocity")
 _CLOSE_TIMEOUT_S = 6.0
 _DISCONNECT_TIMEOUT_S = 2.0
@@ -69,12 +67,12 @@ MAY_BE_MOVING = "THE ARM MAY STILL BE MOVING: PRESS THE EMERGENCY STOP."
 
 
 class ArmProcess:
-    """A connected arm in a child process; keeps the protocol `devices.GuardedArm`.
+    """A connected arm in a child process. It implements `devices.GuardedArm`.
 
     Args:
-        open_arm: connects to the arm. It is pickled and called in the child, so it is a function of a module (or a
-            `functools.partial` of one), not of a script.
-        watchdog_s: while the arm moves, the capture may be silent this long.
+        open_arm: function that connects to the arm. It is pickled and called in the child, so it must be a function of
+            a module (or a `functools.partial` of one), not of a script.
+        watchdog_s: longest silence of the capture while the arm moves.
 
     Raises:
         HardwareError: `open_arm` failed, or the child could not be started.
@@ -101,13 +99,13 @@ class ArmProcess:
                     pass_fds=[there.fileno()],
                     start_new_session=True,
                     stdin=subprocess.DEVNULL,
-                    stdout=2,  # what a library prints must not get into the capture's output
+                    stdout=2,  # keep prints of libraries out of the capture's output
                 )
         except OSError as error:
             self._socket.close()
             raise HardwareError(f"The process that is to hold the arm could not be started: {error}.") from error
         try:
-            # the factory, which may hold a password, goes over the socket and not into the list of processes
+            # Send the factory over the socket. It may have a password, which must not appear in the process list.
             self._socket.settimeout(_OPEN_TIMEOUT_S)
             self._socket.send(pickle.dumps((open_arm, watchdog_s)))
             self._description, self.joint_count = self._answer(0, "open", _OPEN_TIMEOUT_S)
@@ -117,11 +115,11 @@ class ArmProcess:
 
     @property
     def pid(self) -> int:
-        """Of the child."""
+        """Process ID of the child."""
         return self._process.pid
 
     def describe(self) -> dict[str, Any]:
-        """Model and address."""
+        """Return model and address of the arm."""
         return dict(self._description)
 
     def clear_faults(self) -> None:
@@ -129,7 +127,7 @@ class ArmProcess:
         self._call("clear_faults")
 
     def prepare(self) -> None:
-        """See `Arm`; from here on velocities are accepted."""
+        """See `Arm`. Velocities are accepted afterwards."""
         self._call("prepare")
 
     def home_joints(self) -> Floats:
@@ -146,12 +144,12 @@ class ArmProcess:
         """See `Arm`.
 
         Raises:
-            HardwareError: also after a Stop, until `prepare`: says what sent that Stop.
+            HardwareError: also after a Stop until the next `prepare`. The message has the reason of the Stop.
         """
         self._call("send_velocity", linear_m_s)
 
     def send_joint_velocity(self, rad_s: Floats) -> None:
-        """See `Arm`; refused as `send_velocity` is."""
+        """See `Arm`. Refused after a Stop, as in `send_velocity`."""
         self._call("send_joint_velocity", rad_s)
 
     def set_gripper(self, position: float) -> None:
@@ -159,29 +157,29 @@ class ArmProcess:
         self._call("set_gripper", position)
 
     def stop(self) -> None:
-        """Stop all motion; velocities are refused until `prepare`.
+        """Stop all motion. Velocities are refused until the next `prepare`.
 
         Raises:
-            UnconfirmedStopError: the arm confirmed neither Stop nor emergency stop. The child goes on trying.
+            UnconfirmedStopError: the arm confirmed neither Stop nor emergency stop. The child keeps trying.
         """
         self._stop("stop")
 
     def emergency_stop(self) -> None:
-        """The arm's emergency stop, without trying Stop first; otherwise as `stop`."""
+        """Apply the arm's emergency stop without trying Stop first. Otherwise as `stop`."""
         self._stop("emergency_stop")
 
     def halt(self) -> None:
-        """Have Stop sent without waiting: one message, whole or not at all, so a signal handler may do it anywhere."""
-        with suppress(OSError):  # the child is gone or its queue is full; `stop`, which follows, says so
-            os.write(self._socket.fileno(), _HALT)  # not through the socket object, which a call may be using
+        """Request a Stop without waiting. The message is atomic, so a signal handler may call this at any time."""
+        with suppress(OSError):  # the child is gone or its queue is full; `stop`, which follows, reports this
+            os.write(self._socket.fileno(), _HALT)  # bypass the socket object, which an interrupted call may be using
 
     def close(self) -> None:
-        """Disconnect and end the child, which stops the arm first if it moves; harmless twice."""
+        """Disconnect and end the child, which first stops a moving arm. Further calls have no effect."""
         self._socket.close()
         try:
             self._process.wait(_CLOSE_TIMEOUT_S)
         except subprocess.TimeoutExpired:
-            self._process.kill()  # it hangs in the driver; the arm's own timeout stops what moves
+            self._process.kill()  # the driver hangs; the arm's connection timeout then stops the arm
             self._process.wait()
 
     def _stop(self, name: str) -> None:
@@ -217,7 +215,7 @@ class ArmProcess:
             if not data:
                 raise HardwareError(f"The process that holds the arm ended during {name}: it was killed, or it crashed.")
             number, value, error_raised = pickle.loads(data)
-            if number != wanted:  # the answer to a call that a signal interrupted
+            if number != wanted:  # late answer to a call that a signal interrupted
                 continue
             if error_raised is not None:
                 raise error_raised
@@ -225,10 +223,10 @@ class ArmProcess:
 
 
 def serve(handle: int) -> None:
-    """The child's main function: open the arm, carry out requests, watch.
+    """Main function of the child: open the arm, execute requests, and watch the capture.
 
     Args:
-        handle: of the socket to the capture, inherited.
+        handle: inherited file descriptor of the socket to the capture.
     """
     waker, woken = socket.socketpair()
     waker.setblocking(False)
@@ -246,7 +244,7 @@ def serve(handle: int) -> None:
             _send(link, 0, (arm.describe(), arm.joint_count), None)
             _Service(link, woken, arm, watchdog_s).run()
         finally:
-            # a driver that hangs here, or its threads, must not keep the connection alive
+            # Close in a thread, so that a driver that hangs does not keep the connection alive.
             closing = threading.Thread(target=arm.close, daemon=True)
             closing.start()
             closing.join(_DISCONNECT_TIMEOUT_S)
@@ -254,7 +252,7 @@ def serve(handle: int) -> None:
 
 
 def _wake(number: int, _: FrameType | None) -> None:
-    """The wakeup socket tells; this only keeps the signal from ending or suspending the process."""
+    """Keep a signal from ending or suspending the process. The wakeup socket notifies the main loop of it."""
 
 
 @dataclass(frozen=True)
@@ -263,38 +261,38 @@ class _Request:
     name: str
     arguments: tuple[Any, ...]
     stops: int
-    """So many Stops had been ordered when it came."""
+    """Number of Stops requested before this request."""
 
 
 class _Service:
-    """Receives and watches in the main thread, which calls nothing but Stop; a second thread carries out the calls.
+    """Executes requests in a worker thread, while the main thread receives messages and calls only Stop.
 
-    So a call that hangs, or the arm's slow answer, never delays a Stop.
+    So neither a call that hangs nor a slow answer of the arm delays a Stop.
     """
 
     def __init__(self, link: socket.socket, woken: socket.socket, arm: Arm, watchdog_s: float) -> None:
         self._link, self._woken, self._arm, self._watchdog_s = link, woken, arm, watchdog_s
         self._requests: queue.SimpleQueue[_Request | None] = queue.SimpleQueue()
         self._commanding = threading.Lock()
-        """Held while a velocity is on its way to the arm."""
+        """Held while a velocity command is being sent to the arm."""
         self._stops = 0
-        """Stops that were ordered so far. Velocities are accepted while `_prepared` is the same number: there is no
-        order of events in which a prepare releases what a later Stop has locked."""
+        """Number of Stops requested so far. Velocities are accepted only while `_prepared` equals it. So a `prepare`
+        from before a Stop can never unlock velocities after it."""
         self._prepared = -1
         self._reason = "it has not been prepared yet"
         self._moving = False
-        """A velocity came since the last confirmed Stop."""
+        """A velocity was received since the last confirmed Stop."""
         self._unconfirmed = False
         self._tried = self._shouted = 0.0
 
     def run(self) -> None:
-        """Until the capture closes the socket, or dies; then the arm does not move."""
+        """Serve until the capture closes the socket or dies. Then stop the arm if it moves."""
         worker = threading.Thread(target=self._work, name="arm calls", daemon=True)
         worker.start()
         reason = "the capture has ended"
         try:
             self._attend()
-        except Exception as error:  # whatever went wrong here, the arm must not go on
+        except Exception as error:  # stop the arm on any failure
             reason = f"the process that holds it failed ({type(error).__name__}: {error})"
             _shout(f"The arm is stopped and its connection closed: {reason}.")
         self._requests.put(None)
@@ -338,28 +336,28 @@ class _Service:
         elif name == "emergency_stop":
             _send(self._link, number, None, self._halt("the capture sent the emergency stop", attempts=0))
         elif name in _VELOCITIES and self._prepared != self._stops:
-            # refused here, where it arms no watchdog: an arm that nobody has moved gets no Stop
+            # Refuse before the watchdog is armed: no Stop is needed for an arm that has not moved.
             _send(self._link, number, None, self._refusal())
         else:
             if name in _VELOCITIES:
-                self._moving = True  # from here on silence counts, whatever becomes of the command
+                self._moving = True  # arm the watchdog, even if the command fails later
             self._requests.put(_Request(number, name, arguments, self._stops))
 
     def _refusal(self) -> HardwareError:
         return HardwareError(f"The arm was stopped and takes no velocities until it is prepared again: {self._reason}.")
 
     def _halt(self, reason: str, attempts: int = _STOP_ATTEMPTS) -> UnconfirmedStopError | None:
-        self._stops += 1  # first: from here on no velocity goes out
+        self._stops += 1  # first, so that no velocity is sent from now on
         self._reason = reason
         return self._try_stop(attempts)
 
     def _try_stop(self, attempts: int) -> UnconfirmedStopError | None:
-        """Stop, then the emergency stop; None when the arm has confirmed one of them."""
+        """Try Stop, then the emergency stop. Return None if the arm confirmed one of them."""
         self._unconfirmed = True
         in_flight = self._commanding.locked()
         failure = self._stop_confirmed(attempts)
         if in_flight:
-            # it passed the check before this Stop was ordered, and may have followed it on the wire
+            # This velocity passed the check before the Stop, and may have reached the arm after it.
             if self._commanding.acquire(timeout=_IN_FLIGHT_S):
                 self._commanding.release()
                 failure = self._stop_confirmed(attempts)
@@ -381,11 +379,11 @@ class _Service:
             try:
                 self._arm.stop()
                 return None
-            except Exception as error:  # whatever the driver raises, the next attempt must come
+            except Exception as error:  # try again after any error of the driver
                 failure = error
         try:
-            # The last resort: an arm that refuses Stop may still take this, and is then in fault. On a lost link it
-            # fails like Stop did, and costs one call.
+            # Last resort: an arm that refuses Stop may accept this, and is in fault afterwards. If the link is lost,
+            # this fails like Stop and costs one more call.
             self._arm.emergency_stop()
             told = "The arm's" if failure is None else f"The arm did not confirm Stop ({failure}); its"
             _shout(f"{told} emergency stop was applied, and it is in fault.")
@@ -395,9 +393,9 @@ class _Service:
 
     def _work(self) -> None:
         while (request := self._requests.get()) is not None:
-            try:  # pickled in here: what a driver returns need not be picklable
+            try:  # pickling is inside, because results of a driver may not be picklable
                 answer = pickle.dumps((request.number, self._carry_out(request), None))
-            except Exception as failure:  # the capture gets every failure, and this thread goes on
+            except Exception as failure:  # send every failure to the capture, and keep this thread alive
                 answer = pickle.dumps((request.number, None, _sendable(failure)))
             _deliver(self._link, answer)
 
@@ -415,14 +413,14 @@ class _Service:
 
 
 def _sendable(error: Exception) -> DiffCloudError:
-    """Errors of a driver's own kind need not be known, or picklable, on the other side."""
+    """Convert errors of other types to HardwareError. The parent may not be able to unpickle a driver's own types."""
     if type(error) in (HardwareError, UnconfirmedStopError):
-        return error  # type: ignore[return-value]  # one of these two
+        return error  # type: ignore[return-value]  # the type was checked above
     return HardwareError(str(error) if isinstance(error, DiffCloudError) else f"{type(error).__name__}: {error}")
 
 
 def _received(link: socket.socket) -> bytes:
-    """One message; nothing once the other side is gone."""
+    """Receive one message. Empty if the other side is gone."""
     try:
         return link.recv(_LARGEST_MESSAGE)
     except OSError:
@@ -434,7 +432,7 @@ def _send(link: socket.socket, number: int, value: Any, error: DiffCloudError | 
 
 
 def _deliver(link: socket.socket, message: bytes) -> None:
-    with suppress(OSError):  # the capture is gone; the main thread sees it too, and stops the arm
+    with suppress(OSError):  # the capture is gone; the main thread also notices it and stops the arm
         link.send(message)
 
 

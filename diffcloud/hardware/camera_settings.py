@@ -1,7 +1,7 @@
-"""What a RealSense camera is set to while it records: exposure and white balance that are held, laser, preset, pace.
+"""Settings of a RealSense camera during a recording: exposure, white balance, laser, preset, synchronisation.
 
-An exposure that keeps adjusting changes, from one frame to the next, the noise of depth and where depth is missing. So by
-default the camera finds it while it warms up, and then holds it. The settings are read back and kept in camera.json.
+Automatic exposure changes the noise and the holes of depth from frame to frame. So by default the camera adjusts during
+the warm-up, and then exposure, gain and white balance are locked. The settings are read back and stored in camera.json.
 """
 
 from __future__ import annotations
@@ -23,27 +23,27 @@ _HELD = (("enable_auto_exposure", ("exposure", "gain")), ("enable_auto_white_bal
 
 @dataclass(frozen=True)
 class CameraSettings:
-    """What is asked for; None leaves what is set."""
+    """Requested settings. None keeps the current value."""
 
     hold: bool = True
-    """Exposure, gain and white balance stay where they are at the end of the warm-up."""
+    """Lock exposure, gain and white balance at the end of the warm-up."""
     preset: str | None = None
     """Visual preset of the depth sensor, such as high_accuracy."""
     laser_mw: float | None = None
-    """Power of the projector [mW]; 0 switches it off."""
+    """Power of the projector [mW]. 0 switches it off."""
     pace: Pace | None = None
-    """Of cameras that are wired for it, one is the master and the others follow its trigger."""
+    """Role in hardware synchronisation: one camera is the master, and the others follow its trigger over a cable."""
 
 
 def apply(rs: Any, sensors: Mapping[str, Any], settings: CameraSettings, camera: str) -> None:
-    """Before the warm-up: all that is not held.
+    """Apply the settings before the warm-up, with automatic exposure and white balance on.
 
     Args:
-        sensors: "depth" and "color".
-        camera: names it in messages.
+        sensors: "depth" and "color" sensor of the camera.
+        camera: name of the camera, for messages.
 
     Raises:
-        HardwareError: the camera has no such option or preset, or the value is beyond its range; says what it allows.
+        HardwareError: the camera lacks an option or preset, or a value is out of range.
     """
     depth = sensors["depth"]
     if settings.preset is not None:
@@ -57,26 +57,26 @@ def apply(rs: Any, sensors: Mapping[str, Any], settings: CameraSettings, camera:
             _set(rs, depth, "laser_power", settings.laser_mw, camera)
     if settings.pace is not None:
         _set(rs, depth, "inter_cam_sync_mode", float(_PACES[settings.pace]), camera)
-    for sensor in sensors.values():  # an earlier program may have left them held
+    for sensor in sensors.values():  # an earlier program may have locked them
         for automatic, _ in _HELD:
             if sensor.supports(getattr(rs.option, automatic)):
                 _set(rs, sensor, automatic, 1.0, camera)
 
 
 def hold(rs: Any, sensors: Mapping[str, Any], camera: str) -> None:
-    """After the warm-up: what the camera has found stays."""
+    """Lock exposure, gain and white balance at their current values, after the warm-up."""
     for sensor in sensors.values():
         for automatic, names in _HELD:
             if not sensor.supports(getattr(rs.option, automatic)):
                 continue
             found = {name: _get(rs, sensor, name) for name in names if sensor.supports(getattr(rs.option, name))}
             _set(rs, sensor, automatic, 0.0, camera)
-            for name, value in found.items():  # switching it off makes some firmware return to its defaults
+            for name, value in found.items():  # some firmware resets the values when automatic control is switched off
                 _set(rs, sensor, name, value, camera)
 
 
 def read_back(rs: Any, sensors: Mapping[str, Any]) -> dict[str, float]:
-    """Option -> value, such as depth.exposure [µs], of those that the camera has."""
+    """Return option -> value, such as depth.exposure [µs], for all options that the camera has."""
     return {
         f"{kind}.{name}": _get(rs, sensor, name)
         for kind, sensor in sensors.items()

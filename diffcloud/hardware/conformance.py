@@ -1,7 +1,7 @@
-"""Whether a driver does what a capture relies on: units, frames, times, and how soon an arm stands still.
+"""Test a driver against the requirements of a capture: units, frames, times, and stopping distance and time.
 
-Readings do not show all of it: the arm has to move, slowly and a little, and to be stopped in each of the ways that a
-capture relies on: by Stop, by the silence of the capture, and by the silence of the whole link, as when a cable is cut.
+For an arm, readings alone are not sufficient. It must move slowly by a few centimetres and be stopped in each way that
+a capture relies on: Stop, a silent capture (watchdog), and a lost link, as when a cable is cut.
 """
 
 from __future__ import annotations
@@ -28,28 +28,28 @@ from diffcloud.sensing.validation.episode import FARTHEST_M, NEAREST_M
 Floats = NDArray[np.float64]
 
 SPEED_M_S = 0.02
-"""Of all motion here."""
+"""Speed of all test motions."""
 _MOVED_S = 1.0
 _READ_MS = 20.0
-"""Of one reading, the median; the control loop reads 50 times a second."""
+"""Largest median time of one reading. The control loop reads 50 times a second."""
 _COMMAND_S = 0.1
 _STOP_S = 0.3
-"""From Stop to standstill."""
+"""Largest time from Stop to standstill."""
 _LINK_S = 1.0
-"""From the loss of a link to standstill."""
+"""Largest time from loss of the link to standstill."""
 _STILL_M = 2e-4
 _OFF = 0.3
-"""The measured velocity may differ from the commanded one by this fraction of it."""
+"""Largest relative difference between measured and commanded velocity."""
 _TURNED_RAD = float(np.deg2rad(2.0))
 _NEEDED_M = 0.08
-"""Free above the tool."""
+"""Free height needed above the tool."""
 _PULLED_S = 5.0
-"""In which a person pulls the cable."""
+"""Time for the user to pull the cable."""
 _UP = np.array([0.0, 0.0, SPEED_M_S])
 
 
 def check_camera(camera: Camera, *, seconds: float = 2.0, timeout_s: float = 1.0) -> Iterator[Check]:
-    """Open it, take frames, close it."""
+    """Open a camera, read frames for some seconds, and close it. Yield the results of the checks."""
     try:
         info = camera.open()
     except DiffCloudError as error:
@@ -106,14 +106,14 @@ def check_camera(camera: Camera, *, seconds: float = 2.0, timeout_s: float = 1.0
 
 @dataclass(frozen=True)
 class _Way:
-    """How an arm came to rest."""
+    """Time and distance until an arm came to rest."""
 
     seconds: float
     moved_m: float
 
 
 class _Guarded:
-    """An arm that moves up, and whose readings are held against the limits."""
+    """An arm that moves up, with all readings checked against the limits."""
 
     def __init__(self, arm: ArmProcess, checker: ArmChecker) -> None:
         self.arm = arm
@@ -122,9 +122,10 @@ class _Guarded:
         self._watch, self._began = checker.watch("check", self.rest), time.monotonic()
 
     def read(self) -> ArmReading:
-        """
+        """Read the arm and check the reading.
+
         Raises:
-            LimitError: contact, or a limit of the arm.
+            LimitError: contact, or a limit of the arm is exceeded.
         """
         reading, t = self.arm.read(), time.monotonic() - self._began
         self._contact.check(f"At t = {t:.2f} s of the check", reading.wrench)
@@ -132,7 +133,7 @@ class _Guarded:
         return reading
 
     def up(self, seconds: float) -> tuple[Floats, Floats]:
-        """Times [N] and places [N, 3]; the arm moves on at the end."""
+        """Move up and return times [N] [s] and tool positions [N, 3] [m]. The arm is still moving at the end."""
         times, places, commanded = [], [], 0.0
         begun = time.monotonic()
         while (now := time.monotonic()) - begun < seconds:
@@ -152,17 +153,16 @@ def check_arm(
     say: Callable[[str], None] = lambda _: None,
     ask: Callable[[str], None] | None = None,
 ) -> Iterator[Check]:
-    """Readings, and with `move` some centimetres of motion up and down again at 2 cm/s.
+    """Check the readings of an arm and, with `move`, move it up and down by some centimetres at 2 cm/s.
 
     Args:
-        connect: opens the arm; is called again after its process has been killed.
-        checker: with the arm's description and the limits, of which the box must leave room above the tool.
-        say: is called with what happens.
-        ask: prints a request and waits until a person has done it: to pull the cable, and to plug it in again. None leaves
-            that out.
+        connect: function that opens the arm. It is called again after the arm's process was killed.
+        checker: robot description and limits. The workspace box must have room above the tool.
+        say: called with progress messages.
+        ask: shows a request (to pull or plug the cable) and waits until the user has done it. None skips this test.
 
     Raises:
-        HardwareError, LimitError: the arm cannot be moved, or something was in its way. It is stopped.
+        HardwareError, LimitError: the arm cannot be moved, or met an obstacle. It is stopped.
     """
     with closing(connect()) as arm:
         yield from _readings(arm, checker)
@@ -202,10 +202,10 @@ def check_arm(
 
 
 def _pulled(guarded: _Guarded, ask: Callable[[str], None]) -> Floats | None:
-    """The last place [3] that was heard of; None if the cable was not pulled.
+    """Return the last tool position [3] before the link was lost, or None if the cable was not pulled.
 
     Raises:
-        HardwareError, LimitError: something else ended the motion. The arm has been sent Stop.
+        HardwareError, LimitError: something else ended the motion. Stop has been sent.
     """
     ask(f"The arm will move up at 2 cm/s for {_PULLED_S:g} s. Pull its network cable while it moves. Press Enter to start")
     last = None
@@ -216,7 +216,7 @@ def _pulled(guarded: _Guarded, ask: Callable[[str], None]) -> Floats | None:
     except HardwareError as error:
         try:
             guarded.arm.stop()
-        except UnconfirmedStopError:  # only this tells a lost link from an arm in trouble, which still confirms Stop
+        except UnconfirmedStopError:  # the link is lost; an arm with another problem would still confirm Stop
             if isinstance(error, LimitError):
                 raise error from None
         else:
@@ -271,9 +271,9 @@ def _readings(arm: ArmProcess, checker: ArmChecker) -> Iterator[Check]:
 
 
 def _motion(guarded: _Guarded) -> Iterator[Check]:
-    """Whether commanded and measured velocity agree; the arm moves on at the end."""
+    """Compare commanded and measured velocity. The arm is still moving at the end."""
     times, places = guarded.up(_MOVED_S)
-    late = times > _MOVED_S / 2  # it has gathered speed by then
+    late = times > _MOVED_S / 2  # after the arm has accelerated
     velocity = np.polyfit(times[late], places[late], 1)[0]
     off = float(np.linalg.norm(velocity - _UP)) / SPEED_M_S
     yield _check(
@@ -295,7 +295,7 @@ def _stopped(guarded: _Guarded) -> _Way:
 
 
 def _silent(guarded: _Guarded) -> _Way:
-    """The capture hangs: the process that holds the arm has to notice."""
+    """Stop sending commands, as a capture that hangs. The arm's process must stop the arm."""
     guarded.arm.prepare()
     guarded.up(_COMMAND_S)
     before, begun = guarded.read().tool_position_m, time.monotonic()
@@ -319,7 +319,7 @@ def _rest(name: str, way: _Way, within_s: float) -> Check:
 
 
 def _back(guarded: _Guarded, rest: ArmReading, say: Callable[[str], None]) -> Check:
-    """To where it was, at the same speed; what it measures decides when it is there."""
+    """Move back to the start at the same speed, until the measured position is within 1 mm."""
     say("moving back")
     end = time.monotonic() + 3 * _NEEDED_M / SPEED_M_S
     try:

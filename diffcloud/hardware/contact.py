@@ -1,4 +1,4 @@
-"""What the tool feels: the external wrench against its value at rest."""
+"""Contact detection: compare the external wrench at the tool with its value at rest."""
 
 from __future__ import annotations
 
@@ -18,22 +18,22 @@ _INTERVAL_S = 0.02
 
 
 class Contact:
-    """The wrench of an arm at rest, and checks of later ones against it.
+    """The wrench of an arm at rest, against which later wrenches are checked.
 
-    The arm estimates the wrench from its joint torques, which leaves an offset that depends on the pose: so each motion
-    takes its own zero, the mean over some readings. A large one is no offset: the tool is already pressing on something,
-    and a motion could add the whole limit to it.
+    The arm estimates the wrench from its joint torques, with an offset that depends on the pose. So each motion takes
+    its own zero, the mean over some readings at rest. A large value is not an offset: the tool presses on something.
+    The motion could then add the full limit to this force, so it is refused.
 
     Args:
         zero: [6] force [N] and torque [N·m].
 
     Raises:
-        LimitError: not finite, or beyond the preload limits.
+        LimitError: the zero is not finite, or exceeds the preload limits.
     """
 
     def __init__(self, zero: Floats, limits: Limits) -> None:
         force, torque = sizes(zero)
-        kept = {"force": force <= limits.preload_N, "torque": torque <= limits.preload_Nm}  # NaN is not kept
+        kept = {"force": force <= limits.preload_N, "torque": torque <= limits.preload_Nm}  # false for NaN
         if not all(kept.values()):
             beyond = ", ".join(name for name, inside in kept.items() if not inside)
             raise LimitError(
@@ -45,8 +45,10 @@ class Contact:
         self._zero, self._limits = zero, limits
 
     def check(self, when: str, wrench: Floats) -> None:
-        """Raises:
-        LimitError: the change is beyond the limits, or not a number.
+        """Check one wrench.
+
+        Raises:
+            LimitError: the change exceeds the limits, or is not a number.
         """
         limits = self._limits
         force, torque = sizes(wrench - self._zero)
@@ -58,7 +60,7 @@ class Contact:
 
 
 def at_rest(arm: Arm, limits: Limits) -> tuple[ArmReading, Contact]:
-    """The last of some readings of an arm that does not move, and the zero of its wrench from all of them.
+    """Read an arm at rest. Return the last reading, and the zero of the wrench as the mean over all readings.
 
     Raises:
         LimitError: see `Contact`.
@@ -71,5 +73,5 @@ def at_rest(arm: Arm, limits: Limits) -> tuple[ArmReading, Contact]:
 
 
 def sizes(wrench: Floats) -> tuple[float, float]:
-    """Of the force [N] and the torque [N·m] of a wrench [6]."""
+    """Return the magnitudes of force [N] and torque [N·m] of a wrench [6]."""
     return float(np.linalg.norm(wrench[:3])), float(np.linalg.norm(wrench[3:]))

@@ -1,4 +1,4 @@
-"""What a capture asks of cameras and of an arm: `realsense`, `kinova` and `arm_process` keep these, tests bring others."""
+"""Interfaces of cameras and arms for a capture. `realsense`, `kinova` and `arm_process` implement them."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class CameraFrame:
-    """One pair of images."""
+    """A depth image and optional colour image of one moment."""
 
     time_s: float
-    """When it was taken: of a live camera `time.monotonic()`, which nobody can set back; of a file, the file's clock."""
+    """Capture time [s]. A live camera uses `time.monotonic()`, which nobody can set back; a file uses its own clock."""
     depth: NDArray[np.uint16]
     """[H, W] aligned to colour, in units of the camera's depth scale."""
     color: NDArray[np.uint8] | None
@@ -26,7 +26,7 @@ class CameraFrame:
 
 
 class Camera(Protocol):
-    """A depth camera that delivers frames one after the other."""
+    """A depth camera."""
 
     name: str
 
@@ -34,15 +34,15 @@ class Camera(Protocol):
         """Start streaming. Raises HardwareError if it cannot."""
 
     def read(self, timeout_s: float) -> CameraFrame:
-        """The next frame. Raises HardwareError if none comes in time."""
+        """Wait for the next frame. Raises HardwareError if none comes in time."""
 
     def close(self) -> None:
-        """Stop streaming; harmless twice."""
+        """Stop streaming. Further calls have no effect."""
 
 
 @dataclass(frozen=True)
 class ArmReading:
-    """What the arm measures."""
+    """One measurement of the arm."""
 
     joints_rad: Floats
     """[J]."""
@@ -51,56 +51,56 @@ class ArmReading:
     tool_quaternion: Floats
     """[4] (w, x, y, z)."""
     gripper: float | None
-    """0 open to 1 closed."""
+    """From 0 (open) to 1 (closed). None if unknown."""
     wrench: Floats
     """[6] external force [N] and torque [N·m] at the tool."""
 
 
 class Arm(Protocol):
-    """An arm under velocity control. Each call raises HardwareError on a fault or a lost connection."""
+    """An arm under velocity control. Each method raises HardwareError on a fault or a lost connection."""
 
     joint_count: int
 
     def describe(self) -> dict[str, Any]:
-        """Model and address, for episode.json."""
+        """Return model and address, for episode.json."""
 
     def clear_faults(self) -> None:
-        """Clear what can be cleared; the emergency stop must be released first."""
+        """Clear all faults that can be cleared. The emergency stop must be released first."""
 
     def prepare(self) -> None:
-        """Switch to velocity control. Refuses an arm in fault, and one that somebody else is driving."""
+        """Switch to velocity control. Raises HardwareError if the arm is in fault or under manual control."""
 
     def home_joints(self) -> Floats:
-        """[J] joint angles of the arm's own home pose [rad]; nothing moves."""
+        """Return the joint angles [J] of the arm's own home pose [rad], without moving."""
 
     def read(self) -> ArmReading:
-        """Measure."""
+        """Measure joints, tool pose, gripper and wrench."""
 
     def send_velocity(self, linear_m_s: Floats) -> None:
-        """Move the tool with this velocity [3] in the base frame, without turning it, until the next command."""
+        """Move the tool with this velocity [3] in the base frame, without rotation, until the next command."""
 
     def send_joint_velocity(self, rad_s: Floats) -> None:
         """Move the joints with these velocities [J] until the next command."""
 
     def set_gripper(self, position: float) -> None:
-        """Drive the gripper to 0 (open) .. 1 (closed); does not wait."""
+        """Move the gripper to a position from 0 (open) to 1 (closed), without waiting."""
 
     def stop(self) -> None:
-        """Stop all motion; returns once the arm has confirmed it. Must work from another thread."""
+        """Stop all motion and wait for the arm's confirmation. Must work from another thread."""
 
     def emergency_stop(self) -> None:
-        """Stop by the arm's emergency stop, after which it is in fault. Must work from another thread."""
+        """Apply the arm's emergency stop. The arm is in fault afterwards. Must work from another thread."""
 
     def close(self) -> None:
-        """Disconnect; harmless twice."""
+        """Disconnect. Further calls have no effect."""
 
 
 @runtime_checkable
 class GuardedArm(Arm, Protocol):
-    """An arm that is stopped although its user hangs, is suspended or dies (`arm_process.ArmProcess`).
+    """An arm that is stopped even if its user process hangs, is suspended or dies (`arm_process.ArmProcess`).
 
-    Velocities are refused from any Stop until the next `prepare`, whoever sent that Stop.
+    After any Stop, velocities are refused until the next `prepare`.
     """
 
     def halt(self) -> None:
-        """Have Stop sent now, without waiting for the answer; may be called from a signal handler, at any moment."""
+        """Send Stop now without waiting for the answer. A signal handler may call this at any time."""

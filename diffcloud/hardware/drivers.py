@@ -1,8 +1,8 @@
-"""Drivers for arms and cameras of other makes: a user's own classes, named as module:Class.
+"""Load the user's own drivers for arms and cameras, named as module:Class.
 
-A camera's class is called with its name in the episode and its serial number, and implements `devices.Camera`. An arm's
-class is called with its address, and implements `devices.Arm`; it runs in the arm's own process (`arm_process`), which
-watches it as it watches the Gen3's.
+A camera class implements `devices.Camera` and is called with the camera's name and serial number. An arm class
+implements `devices.Arm` and is called with the arm's address. It runs in a separate process with a watchdog
+(`arm_process`), as the driver of the Gen3 does.
 """
 
 from __future__ import annotations
@@ -20,21 +20,21 @@ from diffcloud.hardware.devices import Arm, Camera
 
 
 def open_arm(driver: str, address: str) -> ArmProcess:
-    """The arm at an address, in a process of its own.
+    """Connect to the arm at an address, in a separate process.
 
     Raises:
-        ConfigError: no such driver, or one that lacks a method.
+        ConfigError: the driver does not exist, or lacks a method.
         HardwareError: the driver could not connect.
     """
-    _load(driver, Arm)  # here first, so that its faults are reported before a process is started
+    _load(driver, Arm)  # report errors of the driver before a process is started
     return ArmProcess(partial(_make_arm, driver, address))
 
 
 def make_camera(driver: str, name: str, serial: str, **options: Any) -> Camera:
-    """A camera, not yet open.
+    """Create a camera that is not open yet.
 
     Args:
-        options: width, height and fps that were asked for; a driver that cannot choose them ignores them.
+        options: requested width, height and fps. A driver that cannot set them ignores them.
 
     Raises:
         ConfigError: see `open_arm`.
@@ -53,7 +53,7 @@ def _load(driver: str, protocol: type) -> Callable[..., Any]:
     if not (module and colon and name):
         raise ConfigError(f"A driver is named as module:Class, such as my_lab.arms:Franka, got {driver!r}.")
     here = os.getcwd()
-    if here not in sys.path:  # as `python -m` does: a file beside the recordings is found
+    if here not in sys.path:  # find modules in the current folder, as `python -m` does
         sys.path.insert(0, here)
     try:
         found = getattr(importlib.import_module(module), name)

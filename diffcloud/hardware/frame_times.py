@@ -1,11 +1,10 @@
-"""A camera's timestamps on this computer's monotonic clock.
+"""Convert a camera's time stamps to this computer's monotonic clock.
 
-Drivers stamp frames with the computer's time of day, or with the camera's own counter. The time of day can be set while a
-recording runs (by a person, by a time server), backwards or forwards; the monotonic clock cannot, and the arm's log is on
-it. So the stamps' clock is tied to it once, and from then on checked against two things that nobody sets: the numbers of
-the frames, which cannot come faster than the camera's rate, and the moment of arrival, before which a frame was taken. A
-stamp that contradicts them shows that its clock was set, and the clock is tied anew. Changes of less than half a frame's
-distance backwards, or `_AHEAD_S` forwards, go unnoticed.
+Drivers stamp frames with the computer's time of day or with the camera's own counter. A person or a time server may set
+the time of day during a recording. The monotonic clock of the arm's log cannot be set. So the offset between both
+clocks is measured once and then checked. Frames cannot be faster than the camera's rate, and cannot arrive before they
+are taken. If a stamp contradicts this, its clock was set, and the offset is measured again. Changes of less than half a
+frame interval backwards, or `_AHEAD_S` forwards, are not noticed.
 """
 
 from __future__ import annotations
@@ -15,14 +14,14 @@ import time
 from diffcloud.errors import HardwareError
 
 _AHEAD_S = 0.05
-"""A stamp may lie this far after the frame's arrival: drivers estimate the camera's clock, and the estimate wavers."""
+"""Tolerance for stamps after the arrival of the frame, since drivers only estimate the camera's clock."""
 
 
 def monotonic_of_day(readings: int = 5) -> float:
-    """What is added to the time of day to make it `time.monotonic()` [s], now.
+    """Return the current offset from the time of day to `time.monotonic()` [s].
 
-    Of several pairs of readings the closest counts: a thread that is suspended between both clocks, by another one or by
-    the system, would put milliseconds between the camera's times and the arm's.
+    The closest of several pairs of readings is used. If the thread is suspended between the two readings of a pair, the
+    offset is wrong by milliseconds.
     """
 
     def one() -> tuple[float, float]:
@@ -33,12 +32,12 @@ def monotonic_of_day(readings: int = 5) -> float:
 
 
 class FrameTimes:
-    """Times of one camera's frames.
+    """Converts the time stamps of one camera's frames.
 
     Args:
-        name: of the camera, for messages.
-        period_s: between frames at the set rate, the least there is.
-        longest_s: from a frame's stamp to its arrival, with all queues on the way full.
+        name: name of the camera, for messages.
+        period_s: frame interval at the configured rate.
+        longest_s: longest possible time from a frame's stamp to its arrival, if all queues are full.
     """
 
     def __init__(self, name: str, period_s: float, *, longest_s: float) -> None:
@@ -46,22 +45,22 @@ class FrameTimes:
         self._offset: float | None = None
         self._last: tuple[int, float] | None = None
         self.set_count = 0
-        """How often the clock of the stamps was found to have been set."""
+        """Number of times that the clock of the stamps was found to have been set."""
 
     def tie(self, offset_s: float) -> None:
-        """What is added to stamps; without it, the first frame ties them to its arrival."""
+        """Set the offset that is added to stamps. Without it, the first frame's arrival defines the offset."""
         self._offset = offset_s
 
     def monotonic(self, number: int, stamp_s: float, arrival_s: float) -> float:
-        """time.monotonic() of a frame; rises from frame to frame.
+        """Return the `time.monotonic()` of a frame. Results increase from frame to frame.
 
         Args:
-            number: the camera's count of frames; rises.
-            stamp_s: by the driver's or the camera's clock.
-            arrival_s: time.monotonic() when it was handed over.
+            number: frame number of the camera, increasing.
+            stamp_s: stamp by the clock of the driver or camera.
+            arrival_s: `time.monotonic()` when the frame was received.
 
         Raises:
-            HardwareError: the stamp lies seconds before the arrival: it cannot be placed.
+            HardwareError: the stamp is seconds before the arrival, so the time is unknown.
         """
         if self._offset is None:
             self._offset = arrival_s - stamp_s

@@ -1,4 +1,4 @@
-"""What a capture needs, and whether it is here: packages, cameras, the arm."""
+"""Check whether everything for a capture is installed and connected: packages, cameras, the arm."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from diffcloud.hardware.kinova import TCP_PORT, load_kortex
 from diffcloud.hardware.realsense import connected_cameras
 
 _SPARE_BYTES = 5 * 2**30
-"""Half an hour of two cameras at 10 Hz."""
+"""Disk space for half an hour of two cameras at 10 Hz."""
 
 
 @dataclass(frozen=True)
 class Check:
-    """One line of the report."""
+    """Result of one check."""
 
     name: str
     state: str
@@ -31,12 +31,12 @@ class Check:
 def check_installation(
     *, arm: str | None = None, folder: Path = Path("."), context: Any | None = None, arm_port: int = TCP_PORT
 ) -> list[Check]:
-    """Look at everything; nothing is opened for longer than it takes to look, nothing moves.
+    """Check packages, cameras, arm and disk space. Nothing moves, and no device stays open.
 
     Args:
-        arm: address to try; None leaves the arm alone.
-        folder: where episodes would be written.
-        context: an `rs.context`; None for the computer's own.
+        arm: address of the arm. None skips the arm.
+        folder: folder in which episodes would be written.
+        context: an `rs.context`, by default the computer's own.
     """
     checks = [
         _package("opencv-contrib-python-headless", "images, calibration"),

@@ -1,10 +1,10 @@
-"""Signals end a capture, and stop the arm first.
+"""Stop the arm when a signal ends the capture.
 
-Ctrl-C, Ctrl-Z, Ctrl-\\, a closed terminal, `kill`: whatever would end or suspend this process by default is caught. The
-handler has Stop sent at once, then raises KeyboardInterrupt. A capture cannot be suspended and resumed: the arm and the
-cameras would not wait for it, so Ctrl-Z ends it as Ctrl-C does.
+All catchable signals that would end or suspend the process are handled: Ctrl-C, Ctrl-Z, Ctrl-\\, a closed terminal,
+`kill`. The handler sends Stop at once and raises KeyboardInterrupt. A capture cannot be resumed, since arm and cameras
+would not wait, so Ctrl-Z ends it like Ctrl-C.
 
-SIGKILL, SIGSTOP and crashes cannot be caught; for these the arm lives in a process of its own (`arm_process`).
+SIGKILL, SIGSTOP and crashes cannot be caught. For these cases a separate process stops the arm (`arm_process`).
 """
 
 from __future__ import annotations
@@ -16,22 +16,22 @@ from contextlib import contextmanager
 from types import FrameType
 
 _HARMLESS = {signal.SIGCHLD, signal.SIGCONT, signal.SIGURG, signal.SIGWINCH}
-"""Ignored by default."""
+"""Signals that are ignored by default."""
 _CRASHES = {signal.SIGSEGV, signal.SIGBUS, signal.SIGFPE, signal.SIGILL, signal.SIGTRAP, signal.SIGSYS, signal.SIGABRT}
-"""Python code does not run any more when these come."""
+"""Signals after which Python code does not run any more."""
 
 
 def catchable_signals() -> set[int]:
-    """All signals that end or suspend a process by default and can be caught."""
+    """Return all catchable signals that end or suspend a process by default."""
     uncatchable = {signal.SIGKILL, signal.SIGSTOP}
     return {int(number) for number in signal.valid_signals() - uncatchable - _HARMLESS - _CRASHES}
 
 
 class Interruption:
-    """Catches the signals while it is entered; handlers that the program set itself, and ignored signals, stay.
+    """Context manager that handles signals. Ignored signals and handlers set by the program are not changed.
 
     Args:
-        halt: sends Stop without waiting; is called from the handler.
+        halt: function that sends Stop without waiting. The signal handler calls it.
     """
 
     def __init__(self, halt: Callable[[], None]) -> None:
@@ -41,7 +41,7 @@ class Interruption:
         self._former: dict[int, object] = {}
 
     def __enter__(self) -> Interruption:
-        if threading.current_thread() is threading.main_thread():  # only the main thread may set handlers
+        if threading.current_thread() is threading.main_thread():  # Python allows only the main thread to set handlers
             for number in catchable_signals():
                 if signal.getsignal(number) in (signal.SIG_DFL, signal.default_int_handler):
                     self._former[number] = signal.signal(number, self._handle)
@@ -49,21 +49,21 @@ class Interruption:
 
     def __exit__(self, *_: object) -> None:
         for number, handler in self._former.items():
-            signal.signal(number, handler)  # type: ignore[arg-type]  # what signal.signal has returned
+            signal.signal(number, handler)  # type: ignore[arg-type]  # a value that signal.signal returned
         self._former = {}
 
     def check(self) -> None:
-        """Raise what was caught, in case something swallowed it (an exception in a callback or destructor is lost).
+        """Raise the exception of a caught signal again, in case it was lost in a callback or destructor.
 
         Raises:
-            KeyboardInterrupt: a signal has come.
+            KeyboardInterrupt: a signal was received.
         """
         if self._caught is not None:
             raise KeyboardInterrupt(self._caught)
 
     @contextmanager
     def held(self) -> Iterator[None]:
-        """A second Ctrl-C must not interrupt what the first one causes: in this block nothing is raised."""
+        """In this block, signals raise nothing, so that a second Ctrl-C cannot interrupt the reaction to the first."""
         self._held = True
         try:
             yield
@@ -80,5 +80,5 @@ class Interruption:
 def _name(number: int) -> str:
     try:
         return signal.Signals(number).name
-    except ValueError:  # most real-time signals have none
+    except ValueError:  # most real-time signals have no name
         return str(number)

@@ -1,16 +1,15 @@
-"""A Kinova Gen3 through Kinova's own `kortex_api`.
+"""Driver of the Kinova Gen3, based on Kinova's `kortex_api`.
 
-Commands go over TCP, measurements over UDP (`RefreshFeedback`: joints, tool pose, wrench, faults in one datagram). A
-velocity keeps the arm moving until the next command, so every exit sends Stop; should the link itself be lost, the arm
-stops by the connection timeout that is set here when the session is opened: Kinova documents it as the inactivity after
-which the robot stops any movement that the session initiated. `kortex_api` keeps a session alive by a message every 150 ms,
-from a thread of its own: that timeout sees a lost link and a dead process, not one that hangs. Hence `arm_process`.
+Commands use TCP. Measurements use UDP (`RefreshFeedback`: joints, tool pose, wrench and faults in one datagram). A
+velocity is valid until the next command, so all exits send Stop. If the link is lost, the arm stops after the
+connection timeout that is set when the session is opened. Kinova documents it as the inactivity after which the robot
+stops any movement of the session. A thread of `kortex_api` sends a keep-alive every 150 ms. So the timeout detects a
+lost link or a dead process, but not one that hangs. `arm_process` handles that case.
 
-The way home is driven here, joint by joint, not by the arm's action named Home, of which only the joint angles are read:
-the action has a speed of its own, and would not be held against the limits.
+The motion to home is controlled here in joint space. From the arm's action named Home, only the joint angles are read.
+The action itself has its own speed and would not be checked against the limits.
 
-The arm speaks degrees; everything that leaves this module is in radians. Joint angles are continued across the arm's wrap
-at 360 degrees, so that they can be interpolated.
+The arm uses degrees; this module returns radians. Joint angles are unwrapped at 360°, so that they can be interpolated.
 """
 
 from __future__ import annotations
@@ -36,11 +35,11 @@ JOINT_COUNT = 7
 
 _SESSION_TIMEOUT_MS = 10_000
 _CONNECTION_TIMEOUT_MS = 500
-"""The arm stops by itself when the link has been silent for this long: three keep-alives."""
+"""The arm stops if the link is silent for this time (three keep-alives)."""
 _CALL_TIMEOUT_MS = 400
-"""Of one call; below the watchdog of the arm's process, so that a lost link is reported as one."""
+"""Timeout of one call. It is below the watchdog timeout, so that a lost link is reported as such."""
 _TRANSIENT_S = 3.0
-"""After a session has closed, and after a Stop, the arm may report manual control for a moment."""
+"""Time for which the arm may report manual control after a closed session or a Stop."""
 _FAULTS = {
     0x10: "joint fault",
     0x400: "pose out of reach",
@@ -57,7 +56,7 @@ _FAULTS = {
 
 @dataclass(frozen=True)
 class Kortex:
-    """The parts of kortex_api that are used."""
+    """The used parts of kortex_api."""
 
     TCPTransport: Any
     UDPTransport: Any
@@ -75,11 +74,11 @@ def load_kortex() -> Kortex:
     """Import kortex_api.
 
     Raises:
-        HardwareError: it is not installed; says where to get it and how to install it on this Python.
+        HardwareError: it is not installed. The message explains how to install it.
     """
-    # its generated code needs the pure Python protobuf of today, or protobuf 3.20
+    # Its generated code works with protobuf 3.20, or with the pure Python implementation of newer versions.
     os.environ.setdefault("PROTOCOL_BUFFERS_PYTHON_IMPLEMENTATION", "python")
-    for name in ("MutableMapping", "MutableSequence"):  # moved in Python 3.10; the protobuf it asks for is older
+    for name in ("MutableMapping", "MutableSequence"):  # moved in Python 3.10, but the old protobuf needs them here
         if not hasattr(collections, name):
             setattr(collections, name, getattr(collections.abc, name))
     try:
@@ -112,10 +111,10 @@ class KinovaArm:
 
     Args:
         address: IP address or host name.
-        kortex: the client library; None to import kortex_api.
+        kortex: the client library. None imports kortex_api.
 
     Raises:
-        HardwareError: kortex_api is missing, nothing answers, or the password is wrong.
+        HardwareError: kortex_api is missing, the arm does not answer, or the password is wrong.
     """
 
     joint_count = JOINT_COUNT
@@ -144,15 +143,15 @@ class KinovaArm:
             raise
 
     def describe(self) -> dict[str, Any]:
-        """Model and address."""
+        """Return model and address."""
         return {"model": "Kinova Gen3", "gripper": "Robotiq 2F-85", "address": self.address, "joints": JOINT_COUNT}
 
     def prepare(self) -> None:
-        """Take control of an arm that is ready.
+        """Take control of the arm, which must be ready.
 
         Raises:
-            HardwareError: in fault, driven by somebody else (gamepad, web page, by hand), or otherwise not ready; says how
-                to get it ready.
+            HardwareError: the arm is in fault, under manual control (gamepad, web page, by hand), or otherwise not
+                ready. The message describes the remedy.
         """
         names = self._kortex.Common_pb2
         end = time.monotonic() + _TRANSIENT_S
@@ -178,14 +177,14 @@ class KinovaArm:
         self._call("SetServoingMode", self._base.SetServoingMode, mode)
 
     def clear_faults(self) -> None:
-        """Clear faults; the emergency stop must be released first."""
+        """Clear faults. The emergency stop must be released first."""
         self._call("ClearFaults", self._base.ClearFaults)
 
     def home_joints(self) -> NDArray[np.float64]:
-        """[7] joint angles of the arm's action named Home [rad].
+        """Return the joint angles [7] of the arm's action named Home [rad].
 
         Raises:
-            HardwareError: there is no such action, or it is not for this arm.
+            HardwareError: the action does not exist, or has another number of joints.
         """
         wanted = self._kortex.Base_pb2.RequestedActionType()
         wanted.action_type = self._kortex.Base_pb2.REACH_JOINT_ANGLES
@@ -202,10 +201,10 @@ class KinovaArm:
         raise HardwareError(f"The arm at {self.address} has no action named Home; make one on its web page.")
 
     def read(self) -> ArmReading:
-        """Measure joints, tool, wrench and gripper.
+        """Measure joints, tool pose, wrench and gripper.
 
         Raises:
-            HardwareError: the arm is in fault (names it), or did not answer.
+            HardwareError: the arm is in fault, or did not answer.
         """
         feedback = self._feedback()
         base = feedback.base
@@ -217,14 +216,14 @@ class KinovaArm:
         return ArmReading(
             self._continued(np.deg2rad([actuator.position for actuator in feedback.actuators])),
             np.array([base.tool_pose_x, base.tool_pose_y, base.tool_pose_z]),
-            # theta: rotations about the fixed x, y, z axes, in this order
+            # theta: rotations about the fixed x, y and z axes, in this order
             Rotation.from_euler("xyz", angles, degrees=True).as_quat(scalar_first=True),
             self._gripper(),
             np.array(forces + torques),
         )
 
     def send_velocity(self, linear_m_s: NDArray[np.float64]) -> None:
-        """Move the tool with this velocity [3] in the base frame, without turning, until the next command."""
+        """Move the tool with this velocity [3] in the base frame, without rotation, until the next command."""
         self._refuse_nan(linear_m_s)
         command = self._kortex.Base_pb2.TwistCommand()
         command.reference_frame = self._kortex.Common_pb2.CARTESIAN_REFERENCE_FRAME_BASE
@@ -242,7 +241,7 @@ class KinovaArm:
         self._call("SendJointSpeedsCommand", self._base.SendJointSpeedsCommand, command)
 
     def set_gripper(self, position: float) -> None:
-        """Drive the gripper to 0 (open) .. 1 (closed); does not wait."""
+        """Move the gripper to a position from 0 (open) to 1 (closed), without waiting."""
         command = self._kortex.Base_pb2.GripperCommand()
         command.mode = self._kortex.Base_pb2.GRIPPER_POSITION
         finger = command.gripper.finger.add()
@@ -255,15 +254,15 @@ class KinovaArm:
         self._call("Stop", self._base.Stop)
 
     def emergency_stop(self) -> None:
-        """Kinova's ApplyEmergencyStop; the arm is in fault afterwards.
+        """Call Kinova's ApplyEmergencyStop. The arm is in fault afterwards.
 
-        `arm_process` calls it, as the last resort, where Stop is refused or not answered: to an arm that answers but will
-        not stop there is nothing else to say. It is no substitute for the button, which also works without a link.
+        `arm_process` calls this as a last resort, if Stop is refused or not answered. It does not replace the emergency
+        button, which also works without a link.
         """
         self._call("ApplyEmergencyStop", self._base.ApplyEmergencyStop)
 
     def close(self) -> None:
-        """Close sessions and links; harmless twice, and on a link that is gone."""
+        """Close sessions and links. Further calls have no effect. A lost link is not an error."""
         links, self._links = self._links, []
         for session, router, transport in reversed(links):
             for step in (
@@ -273,7 +272,7 @@ class KinovaArm:
             ):
                 try:
                     step()
-                except Exception:  # a lost link fails here in many ways, and there is nothing left to do about it
+                except Exception:  # a lost link raises many types of errors, and none can be handled here
                     continue
 
     def _link(self, kind: Any, port: int, username: str, password: str) -> Any:
@@ -288,7 +287,7 @@ class KinovaArm:
             info.session_inactivity_timeout = _SESSION_TIMEOUT_MS
             info.connection_inactivity_timeout = _CONNECTION_TIMEOUT_MS
             session.CreateSession(info)
-        except Exception as error:  # the library raises its own kinds, sockets theirs
+        except Exception as error:  # kortex_api and sockets raise different types
             raise HardwareError(
                 f"No arm answers at {self.address}:{port} ({type(error).__name__}: {error}). Check power, cable, that this "
                 "computer is in the arm's network (ping it), and user name and password."
@@ -323,7 +322,7 @@ class KinovaArm:
         return float(fingers[0].value) if len(fingers) else None
 
     def _continued(self, joints: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The arm reports 0..360 degrees: the first reading comes into (-pi, pi], later ones follow it without a jump."""
+        """Unwrap joint angles. The first reading is in (-pi, pi], later ones continue without jumps."""
         reference = np.zeros_like(joints) if self._joints is None else self._joints
         self._joints = reference + (joints - reference + np.pi) % (2 * np.pi) - np.pi
         return self._joints.copy()

@@ -1,8 +1,7 @@
-"""The control loop: measure, check, command, and nothing else; it waits for no disk and no camera.
+"""The control loop: measure, check, command. It never waits for a disk or a camera.
 
-The way home, the approach and the recorded trajectory run through one loop, with the same checks. The arm is read about 50
-times a second and commanded at the control rate. That the capture itself may hang is the business of `arm_process`, which
-looks before each command whether the arm has been stopped meanwhile.
+The motion home, the approach and the trajectory use the same loop and the same checks. The arm is read about 50 times a
+second and commanded at the control rate. `arm_process` handles a capture that hangs, and refuses commands after a Stop.
 """
 
 from __future__ import annotations
@@ -25,26 +24,26 @@ from diffcloud.hardware.trajectory import Limits, ToolTrajectory, VelocityContro
 Floats = NDArray[np.float64]
 
 _LOG_RATE_HZ = 50.0
-"""The arm is read about this often: joint angles are interpolated to the images' times, and limits are checked."""
+"""Approximate reading rate of the arm. Joint angles are later interpolated to the times of images."""
 _CATCH_UP = 1.5
-"""On the way home a correction may make joints this much faster than the path's fastest joint at its fastest."""
+"""Factor by which corrections may exceed the highest joint speed of the path home."""
 _JOINT_ERROR_RAD = 0.15
-"""Farther from its path home than this, something holds the arm."""
+"""Largest deviation from the path home. A larger one means that something blocks the arm."""
 _GRIPPER_WAIT_S = 3.0
 _GRIPPER_STILL = 25
-"""Readings without a change after which a gripper has arrived, on its target or on what it holds."""
+"""Number of unchanged readings after which a gripper has reached its target or an object."""
 
 
 @dataclass(frozen=True)
 class Motion:
-    """An arm, and what it must keep to."""
+    """An arm with its limits and settings."""
 
     arm: GuardedArm
     checker: ArmChecker
     limits: Limits
     settings: CaptureSettings
     check: Callable[[], None]
-    """Raises when the capture is to end: a signal."""
+    """Function that raises KeyboardInterrupt if a signal has ended the capture."""
 
 
 class _Follower(Protocol):
@@ -56,10 +55,10 @@ class _Follower(Protocol):
 
 
 class ToolFollower:
-    """Follows a trajectory of the tool by Cartesian velocities.
+    """Follows a tool trajectory with Cartesian velocities.
 
     Args:
-        start: reading of the arm at rest, before it.
+        start: reading of the arm at rest, before the motion.
     """
 
     def __init__(self, motion: Motion, name: str, trajectory: ToolTrajectory, start: ArmReading, contact: Contact) -> None:
@@ -73,8 +72,10 @@ class ToolFollower:
         self.largest_error_m = 0.0
 
     def check(self, t: float, reading: ArmReading) -> None:
-        """Raises:
-        LimitError: contact, a limit of the arm, or too far from the trajectory.
+        """Check one reading.
+
+        Raises:
+            LimitError: contact, a limit is exceeded, or the tool is too far from the trajectory.
         """
         self._contact.check(f"At t = {t:.2f} s of the {self._name}", reading.wrench)
         self._watch.check(t, reading)
@@ -87,7 +88,7 @@ class ToolFollower:
             )
 
     def command(self, t: float, reading: ArmReading) -> None:
-        """The gripper where its state changes, and the velocity."""
+        """Send the velocity, and the gripper command if its state changes."""
         gripper = self._trajectory.gripper_at(t)
         if gripper is not None and gripper != self._gripper:
             self._arm.set_gripper(gripper)
@@ -96,7 +97,7 @@ class ToolFollower:
 
 
 class JointFollower:
-    """Follows a path in joint space by joint velocities."""
+    """Follows a path in joint space with joint velocities."""
 
     def __init__(self, motion: Motion, name: str, path: JointPath, start: ArmReading, contact: Contact) -> None:
         self._arm, self._contact, self._name, self._path = motion.arm, contact, name, path
@@ -106,8 +107,10 @@ class JointFollower:
         self.duration_s = path.duration_s
 
     def check(self, t: float, reading: ArmReading) -> None:
-        """Raises:
-        LimitError: contact, a limit of the arm, or too far from the path.
+        """Check one reading.
+
+        Raises:
+            LimitError: contact, a limit is exceeded, or a joint is too far from the path.
         """
         self._contact.check(f"At t = {t:.2f} s of the {self._name}", reading.wrench)
         self._watch.check(t, reading)
@@ -120,25 +123,25 @@ class JointFollower:
             )
 
     def command(self, t: float, reading: ArmReading) -> None:
-        """The path's velocity of the coming period, and a correction."""
+        """Send the path's velocity for the next period, plus a proportional correction."""
         ahead, here = self._path.at(t + self._period), self._path.at(t)
         wanted = (ahead - here) / self._period + self._gain * (here - reading.joints_rad)
-        # the whole vector: clipped joint by joint, the arm would leave the path's direction
+        # Scale the whole vector. Clipping single joints would change the direction of the motion.
         largest = float(np.abs(wanted).max())
         self._arm.send_joint_velocity(wanted if largest <= self._fastest else wanted * (self._fastest / largest))
 
 
 def go_to_start(motion: Motion, trajectory: ToolTrajectory, tell: Callable[[str], None]) -> tuple[ArmReading, Contact]:
-    """Bring the arm to the first keyframe, over home if that is set, then the gripper to its first state.
+    """Move the arm to the first keyframe, via home if requested, and the gripper to its first state.
 
-    Everything that will move is planned and checked before anything does.
+    All motions are planned and checked before the arm moves.
 
     Returns:
-        The arm at rest, ready for the trajectory.
+        Reading and contact reference of the arm at rest, ready for the trajectory.
 
     Raises:
-        LimitError: the plan breaks a limit, or the motion does.
-        HardwareError: the arm is in fault, driven by somebody else, or lost.
+        LimitError: a limit is exceeded by the plan or during the motion.
+        HardwareError: the arm is in fault, under manual control, or does not answer.
     """
     arm, limits, checker = motion.arm, motion.limits, motion.checker
     speed = min(motion.settings.approach_speed_m_s, limits.speed_m_s)
@@ -156,7 +159,7 @@ def go_to_start(motion: Motion, trajectory: ToolTrajectory, tell: Callable[[str]
     if way is not None:
         tell(f"approaching the first keyframe, {way.duration_s:.1f} s")
         run(motion, ToolFollower(motion, "approach", way, rest, contact))
-    if trajectory.gripper is not None:  # not before: on the way here it must not let go, nor grasp
+    if trajectory.gripper is not None:  # only now, so that the gripper neither drops nor grasps anything on the way
         _set_gripper(motion, float(trajectory.gripper[0]))
     arm.prepare()
     return at_rest(arm, limits)
@@ -169,11 +172,11 @@ def run(
     start: float | None = None,
     heard: Callable[[float, ArmReading], None] = lambda _, __: None,
 ) -> None:
-    """Drive the arm until the follower's duration and the settings' hold are over, then stop it.
+    """Control the arm for the follower's duration plus the hold time, then stop it.
 
     Args:
-        start: of the motion, by time.monotonic(); None for now.
-        heard: gets each reading and the monotonic time it was taken at; must not wait.
+        start: start time by `time.monotonic()`. None: now.
+        heard: called with the monotonic time and each reading. It must not block.
     """
     period = 1 / motion.settings.rate_hz
     readings_per_tick = max(1, round(_LOG_RATE_HZ * period))
@@ -192,13 +195,13 @@ def run(
 def plan_motion(
     checker: ArmChecker, trajectory: ToolTrajectory, start: ArmReading, *, speed_m_s: float
 ) -> ToolTrajectory | None:
-    """The approach from `start`, or None where it is at the first keyframe; it and the trajectory keep the limits.
+    """Plan the approach from `start` to the first keyframe (None if already there), and check it and the trajectory.
 
     Args:
-        speed_m_s: of the approach.
+        speed_m_s: speed of the approach.
 
     Raises:
-        LimitError: one of both breaks a limit: box, joints, reach, singularity, links.
+        LimitError: one of them exceeds a limit (box, joints, reach, singularity, links).
     """
     position, limits = start.tool_position_m, checker.limits
     if limits.outside(position, limits.box_slack_m):
@@ -206,7 +209,7 @@ def plan_motion(
             f"The tool is at {position.round(3).tolist()} m, outside the workspace box {limits.box_low_m} to "
             f"{limits.box_high_m}. Bring it inside first (--home, or by hand), or widen workspace_m in rig.yaml."
         )
-    # a box is convex: between a start and a goal inside it the straight line is inside too
+    # The box is convex, so the straight line between two points inside is inside too.
     way = approach(position, trajectory.positions[0], speed_m_s=min(speed_m_s, limits.speed_m_s))
     if way is not None:
         start = checker.check_trajectory("approach", way, start)
@@ -215,7 +218,7 @@ def plan_motion(
 
 
 def _set_gripper(motion: Motion, position: float) -> None:
-    """Set it, and wait until it has arrived or stands still; as long as it may take, where the arm does not say."""
+    """Move the gripper and wait until it has arrived or stopped. If it reports no state, wait `_GRIPPER_WAIT_S`."""
     motion.arm.set_gripper(position)
     last, still = np.nan, 0
     end = time.monotonic() + _GRIPPER_WAIT_S
@@ -231,7 +234,7 @@ def _set_gripper(motion: Motion, position: float) -> None:
 
 
 def _ticks(start: float, period: float, duration: float) -> Iterator[float]:
-    """Times since `start`, each yielded when it has come; a late loop skips none but does not wait."""
+    """Yield times since `start` when they have come. A late loop skips no tick, but does not wait."""
     count = int(np.ceil(duration / period)) + 1
     for index in range(count):
         ahead = start + index * period - time.monotonic()

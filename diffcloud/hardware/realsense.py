@@ -1,8 +1,8 @@
-"""RealSense depth cameras: live, recorded, and played back.
+"""RealSense depth cameras: live, recording, and playback.
 
-The package pyrealsense2 is imported when a camera is opened. Everything takes an `rs.context`, so that the same code runs
-on software devices: no camera is needed to test it. Depth is aligned to colour, since masks and calibration live in the
-colour image; no filter of the SDK is applied, since an episode keeps what was measured.
+pyrealsense2 is imported when a camera is opened. All functions accept an `rs.context`, so tests can use software
+devices instead of cameras. Depth is aligned to colour, because masks and calibration are in the colour image. No
+filters of the SDK are applied, because an episode stores raw measurements.
 """
 
 from __future__ import annotations
@@ -29,19 +29,19 @@ from diffcloud.io.raw_episodes import CameraInfo
 from diffcloud.io.recordings import RecordedFrame, Recording
 
 _QUEUED_PAIRS = 64
-"""The SDK keeps so many for us; a pipeline without a queue of its own keeps one, and drops the rest when we are late."""
+"""Length of the SDK's queue. Without an explicit queue, a pipeline keeps one pair of images and drops the others."""
 _LONGEST_WAY_S = 3.0
-"""From the camera to that queue."""
+"""Longest time from the camera to this queue."""
 _PLAYBACK_WAIT_MS = 100
 _PLAYBACK_PATIENCE = 50
-"""Waits without a frame, while the file is not at its end."""
+"""Number of waits without a frame after which playback is considered finished."""
 
 
 def import_realsense() -> Any:
-    """pyrealsense2, with libusb found where the system has none.
+    """Import pyrealsense2. If the system has no libusb, the one of libusb-package is loaded first.
 
     Raises:
-        HardwareError: it cannot be imported; says what to install.
+        HardwareError: it cannot be imported. The message lists what to install.
     """
     try:
         load_libusb()
@@ -55,10 +55,10 @@ def import_realsense() -> Any:
 
 
 def connected_cameras(context: Any | None = None) -> list[dict[str, str]]:
-    """Name, serial, firmware and USB type of each camera that is plugged in.
+    """Return name, serial, firmware and USB type of each connected camera.
 
     Raises:
-        HardwareError: the library cannot be imported, or cannot look for cameras.
+        HardwareError: the library cannot be imported, or cannot search for cameras.
     """
     rs = import_realsense()
     fields = {
@@ -69,7 +69,7 @@ def connected_cameras(context: Any | None = None) -> list[dict[str, str]]:
     }
     try:
         devices = (rs.context() if context is None else context).query_devices()
-    except RuntimeError as error:  # of the library: no home folder, or no access to USB
+    except RuntimeError as error:  # raised by the library without a home folder or access to USB
         raise HardwareError(
             f"The RealSense library cannot look for cameras ({error}). Set HOME to a folder that exists, and check the "
             "udev rules."
@@ -79,15 +79,15 @@ def connected_cameras(context: Any | None = None) -> list[dict[str, str]]:
 
 
 class RealSenseCamera:
-    """A live camera, opened by its serial number.
+    """A live camera, identified by its serial number.
 
     Args:
-        name: the camera's name in the episode.
-        context: an `rs.context`; None for the computer's own.
-        fps: of the camera (a D435 knows 6, 15, 30 and 60).
-        record_to: also write the SDK's own recording (`.db3`), which keeps depth as it was before alignment.
-        warm_up: pairs dropped at the start, while exposure settles.
-        settings: exposure, laser, preset and pace.
+        name: name of the camera in the episode.
+        context: an `rs.context`, by default the computer's own.
+        fps: frame rate of the camera (a D435 supports 6, 15, 30 and 60).
+        record_to: also write a recording of the SDK (`.db3`), in which depth is not aligned.
+        warm_up: number of frames dropped at the start, while the exposure adjusts.
+        settings: exposure, laser, preset and synchronisation.
     """
 
     def __init__(
@@ -113,13 +113,13 @@ class RealSenseCamera:
         self._last_number: int | None = None
         self._times: FrameTimes | None = None
         self.dropped = 0
-        """Frames that the camera numbered and nobody received."""
+        """Number of frames that were lost, according to the camera's frame numbers."""
 
     def open(self) -> CameraInfo:
         """Start streaming.
 
         Raises:
-            HardwareError: not connected, busy, or without such a stream; lists what is connected.
+            HardwareError: the camera is not connected, busy, or lacks the stream. The message lists connected cameras.
         """
         rs = import_realsense()
         if self._record_to is not None and self._record_to.suffix != ".db3":
@@ -161,10 +161,10 @@ class RealSenseCamera:
         return info
 
     def read(self, timeout_s: float) -> CameraFrame:
-        """The next pair, depth aligned to colour.
+        """Wait for the next frame, with depth aligned to colour.
 
         Raises:
-            HardwareError: none came within `timeout_s`: unplugged, or the USB link is overloaded.
+            HardwareError: none came within `timeout_s`: the camera is unplugged, or the USB link is overloaded.
         """
         if self._pipeline is None:
             raise HardwareError(f"Camera {self.name} is not open.")
@@ -183,14 +183,14 @@ class RealSenseCamera:
         )
 
     def close(self) -> None:
-        """Stop streaming; harmless twice."""
+        """Stop streaming. Further calls have no effect."""
         if self._pipeline is not None:
             pipeline, self._pipeline = self._pipeline, None
             with _explained(f"Camera {self.name} ({self.serial}) could not be closed"):
                 pipeline.stop()
 
     def _timed(self, frame: CameraFrame, depth: Any, arrival_s: float) -> CameraFrame:
-        """Stamps are in the computer's time of day or, of some drivers, in the camera's own, which the first frame ties."""
+        """Convert the stamp to monotonic time. Stamps are in the computer's time of day or the camera's clock."""
         if self._times is None:
             self._times = FrameTimes(
                 f"{self.name} ({self.serial})", 1 / self._fps, longest_s=_QUEUED_PAIRS / self._fps + _LONGEST_WAY_S
@@ -201,7 +201,7 @@ class RealSenseCamera:
         return CameraFrame(t, frame.depth, frame.color)
 
     def _is_new(self, number: int) -> bool:
-        """The syncer may pair one depth image with two colour images; only the first counts."""
+        """Whether the depth frame is new. The SDK's syncer may pair one depth image with two colour images."""
         if self._last_number is not None:
             if number <= self._last_number:
                 return False
@@ -212,25 +212,25 @@ class RealSenseCamera:
 
 @contextmanager
 def play_recording(path: Path, name: str, *, alone: bool = True) -> Iterator[tuple[CameraInfo, Iterator[CameraFrame]]]:
-    """A recording of the SDK (`.db3`, or an old `.bag`): the camera, and its frames with depth aligned to colour.
+    """Open a recording of the SDK (`.db3`, or an old `.bag`). Yields the camera and its frames, aligned to colour.
 
-    Plays as fast as the frames are taken, once, without dropping any.
+    Playback is as fast as frames are consumed, happens once, and drops no frames.
 
     Args:
-        alone: otherwise its times will be compared with those of other cameras.
+        alone: False if times will be compared with those of other cameras.
 
     Raises:
-        HardwareError: missing, not a recording, without depth and colour, or stamped by the camera's own clock though it is
-            not alone.
+        HardwareError: the file is missing, not a recording, or lacks depth or colour. Also if it is stamped by the
+            camera's own clock and `alone` is False.
     """
     rs = import_realsense()
     if not Path(path).is_file():
         raise HardwareError(f"No such recording: {path}.")
     config, pipeline = rs.config(), rs.pipeline()
     with _explained(f"{path} is not a RealSense recording with depth and colour"):
-        # from here on the SDK would repeat the file and drop what is not taken in time, unless told otherwise
+        # By default, the SDK repeats the file and drops frames that are not consumed in time.
         config.enable_device_from_file(str(path), repeat_playback=False)
-        # before the start, and paused until both sensors stream, or the first frames of one are already dropped
+        # Pause before the start, until both sensors stream. Otherwise the first frames of one sensor are dropped.
         playback = config.resolve(rs.pipeline_wrapper(pipeline)).get_device().as_playback()
         playback.set_real_time(False)
         playback.pause()
@@ -250,7 +250,7 @@ def play_recording(path: Path, name: str, *, alone: bool = True) -> Iterator[tup
 
 @contextmanager
 def play_recordings(paths: Mapping[str, Path]) -> Iterator[Recording]:
-    """Recordings of several cameras that ran together, by the camera's name, merged in order of time."""
+    """Open simultaneous recordings of several cameras (camera name -> path), merged in order of time."""
     with ExitStack() as stack:
         alone = len(paths) == 1
         played = {name: stack.enter_context(play_recording(path, name, alone=alone)) for name, path in paths.items()}
@@ -270,13 +270,14 @@ def _has_ended(playback: Any, stopped: Any) -> bool:
 
 
 def _played(pipeline: Any, align: Any, ended: Callable[[], bool], path: Path, foreign: Any) -> Iterator[CameraFrame]:
-    """
+    """Yield the frames of a playback.
+
     Args:
-        foreign: the domain of stamps that is refused; None where all are good.
+        foreign: clock domain of stamps that is refused. None accepts all.
     """
     last, waits = -1, 0
     while True:
-        at_end = ended()  # asked first: a frame may come between the wait and the question
+        at_end = ended()  # ask first, since a frame may arrive between the wait and this question
         come, frames = pipeline.try_wait_for_frames(_PLAYBACK_WAIT_MS)
         waits = 0 if come else waits + 1
         if not come:
@@ -291,20 +292,20 @@ def _played(pipeline: Any, align: Any, ended: Callable[[], bool], path: Path, fo
                     "recordings of several cameras cannot be brought together. Import each alone, or record with global "
                     "time enabled, which stamps frames with the computer's time."
                 )
-            if number > last:  # the syncer may pair one depth image with two colour images
+            if number > last:  # the SDK's syncer may pair one depth image with two colour images
                 last = number
                 yield _frame(align.process(frames))
 
 
 def _frame(frames: Any) -> CameraFrame:
     depth, color = frames.get_depth_frame(), frames.get_color_frame()
-    # copies: the SDK takes its buffers back
+    # Copy the images, because the SDK reuses its buffers.
     return CameraFrame(depth.get_timestamp() / 1000, np.array(depth.get_data()), np.array(color.get_data()))
 
 
 def _sensors(rs: Any, profile: Any) -> dict[str, Any]:
-    """depth, and color where it is a sensor of its own."""
-    # not first_depth_sensor(): the wrapper around a device that is being recorded does not know its kind
+    """Return the sensors "depth" and, if it is a separate sensor, "color"."""
+    # first_depth_sensor() fails here, since a device that is being recorded has a wrapper without the sensor type.
     found = list(profile.get_device().query_sensors())
     depth = next((sensor for sensor in found if sensor.supports(rs.option.depth_units)), None)
     others = [sensor for sensor in found if not sensor.supports(rs.option.depth_units)]
@@ -312,7 +313,7 @@ def _sensors(rs: Any, profile: Any) -> dict[str, Any]:
 
 
 def _camera_info(rs: Any, name: str, serial: str, profile: Any) -> CameraInfo:
-    """Of a started pipeline; depth is aligned to colour, so the intrinsics are those of colour."""
+    """Describe the camera of a started pipeline. Depth is aligned to colour, so the intrinsics are those of colour."""
     sensors = _sensors(rs, profile)
     if not sensors:
         raise HardwareError(f"Camera {name} ({serial}) states no depth scale: it is not a depth camera.")
@@ -333,16 +334,16 @@ def _camera_info(rs: Any, name: str, serial: str, profile: Any) -> CameraInfo:
         held.fy,
         held.ppx,
         held.ppy,
-        distortion=models[held.model] if distorted else "none",  # type: ignore[arg-type]  # str, of the literals above
+        distortion=models[held.model] if distorted else "none",  # type: ignore[arg-type]  # a str from `models`
         coefficients=tuple(held.coeffs) if distorted else (),
     )
-    # 0.001 arrives as a float32
+    # Remove the rounding of float32, in which the SDK returns 0.001.
     return CameraInfo(name, serial, intrinsics, float(np.format_float_positional(np.float32(scale), unique=True)))
 
 
 @contextmanager
 def _explained(what: str) -> Iterator[None]:
-    """The SDK raises RuntimeError for everything."""
+    """Convert the RuntimeErrors of the SDK to HardwareErrors with a context."""
     try:
         yield
     except RuntimeError as error:

@@ -1,11 +1,11 @@
-"""What writes a recording while it runs; the arm's control loop waits for nothing here.
+"""Threads that write a recording, so that the arm's control loop never waits.
 
-Each camera has a thread that takes its frames and one that writes them; the arm's readings have a queue and a thread that
-writes them, many rows at a time when the disk is slow. So neither a slow disk nor a slow camera holds up the arm.
+Each camera has one thread that reads frames and one that writes them. The arm's readings have a queue and a thread,
+which writes many rows at once if the disk is slow. So neither a slow disk nor a slow camera delays the arm.
 
-A signal's KeyboardInterrupt may come between almost any two instructions of the control loop's thread. `queue.Queue` and
-`threading.Event` take their locks in Python code. If it came there they would stay locked, and the capture would wait for
-them for ever. So that thread uses `SimpleQueue`, whose `put` is one instruction, and plain attributes.
+A signal may raise KeyboardInterrupt between almost any two instructions of the control loop's thread. `queue.Queue` and
+`threading.Event` take locks in Python code. An interrupt there would leave them locked, and the capture would wait
+forever. So this thread uses `SimpleQueue`, whose `put` is one instruction, and plain attributes.
 """
 
 from __future__ import annotations
@@ -22,18 +22,18 @@ from diffcloud.io.raw_episodes import RawEpisodeWriter, RobotSample
 
 _QUEUED_FRAMES = 64
 _QUEUED_ROWS = 1500
-"""Half a minute of the arm's readings."""
+"""About half a minute of the arm's readings."""
 _OVERDUE_S = 0.5
-"""A driver that takes this much longer than its timeout hangs."""
+"""Delay beyond its timeout after which a driver is considered to hang."""
 _WATCH_S = 0.1
 _FULL_S = 0.005
-"""Between two looks at a queue that is full."""
+"""Interval for polling a full queue."""
 _AHEAD_S = 1.0
-"""No frame was taken later than now; clocks that are tied to each other differ by milliseconds."""
+"""Tolerance for frame times in the future. Clock offsets are accurate to milliseconds."""
 
 
 class Clock:
-    """Seconds since the start of the recording. Monotonic: setting the computer's time changes nothing."""
+    """Seconds since the start of the recording. Monotonic, so changes of the computer's time have no effect."""
 
     def __init__(self) -> None:
         self.start = time.monotonic()
@@ -46,11 +46,11 @@ class Clock:
 
 
 class Recorders:
-    """All cameras and, where there is one, the arm's log; the first failure of any is raised in the control loop.
+    """Recorders of all cameras and of the arm's log. The first failure is raised in the control loop.
 
     Args:
-        frames_hz: so many of a camera's frames are written in a second; None writes all.
-        camera_timeout_s: a camera that is silent for longer has failed.
+        frames_hz: number of frames written per second and camera. None writes all.
+        camera_timeout_s: a camera that delivers no frame for this time has failed.
     """
 
     def __init__(
@@ -73,10 +73,10 @@ class Recorders:
             recorder.start()
 
     def add_reading(self, t_s: float, reading: ArmReading) -> None:
-        """A row of robot.csv, written by another thread.
+        """Queue a row of robot.csv, which another thread writes.
 
         Raises:
-            HardwareError: so many rows wait that the disk must have stopped.
+            HardwareError: too many rows are queued, so the disk has probably stopped.
         """
         assert self._arm is not None
         self._arm.add(
@@ -86,14 +86,14 @@ class Recorders:
         )
 
     def end_cameras(self) -> None:
-        """No more frames are taken; what is queued is written."""
+        """Stop reading frames, and write all queued frames."""
         for recorder in self._cameras:
             recorder.end()
         for recorder in self._cameras:
             recorder.join()
 
     def finish(self) -> None:
-        """Everything that is queued is written."""
+        """Stop all recorders, and write everything that is queued."""
         self.end_cameras()
         if self._arm is not None:
             self._arm.end()
@@ -106,10 +106,10 @@ class Recorders:
             self.raise_failure()
 
     def raise_failure(self) -> None:
-        """Of any recorder, the first.
+        """Raise the first failure of any recorder.
 
         Raises:
-            DiffCloudError: what a camera or the disk raised, or that a camera's driver hangs.
+            DiffCloudError: the error of a camera or the disk, or a camera's driver hangs.
         """
         for camera in self._cameras:
             camera.check_driver()
@@ -122,7 +122,7 @@ class Recorders:
 
 
 class _CameraRecorder:
-    """Takes and writes the frames of one camera, in two threads."""
+    """Reads and writes the frames of one camera, in two threads."""
 
     def __init__(
         self,
@@ -140,7 +140,7 @@ class _CameraRecorder:
         self._ending = False
         self._frames: queue.SimpleQueue[CameraFrame | None] = queue.SimpleQueue()
         self._asked: float | None = None
-        """time.monotonic() when the driver was asked for a frame; None while it is not being asked."""
+        """`time.monotonic()` of the current call of the driver. None if no call is in progress."""
         self._taker, self._writing = (
             threading.Thread(target=target, name=f"{camera.name}{target.__name__}", daemon=True)
             for target in (self._take, self._write)
@@ -154,7 +154,7 @@ class _CameraRecorder:
         self._ending = True
 
     def join(self) -> None:
-        """What is queued is written. A driver that hangs is left behind: its thread ends with the process."""
+        """Wait until all queued frames are written. A thread in a driver that hangs is abandoned."""
         while self._taker.is_alive() and not self._hangs():
             self._taker.join(_WATCH_S)
         if self._taker.is_alive():
@@ -163,7 +163,7 @@ class _CameraRecorder:
             self._writing.join()
 
     def check_driver(self) -> None:
-        """Notice one that neither delivers nor raises."""
+        """Report a driver that hangs: it neither delivers a frame nor raises an error."""
         if self.error is None and self._hangs():
             self._fail(
                 HardwareError(
@@ -184,14 +184,14 @@ class _CameraRecorder:
                 frame = self._camera.read(self._timeout_s)
                 self._asked = None
                 t = self._clock.of(frame.time_s)
-                if count == 0 and t < 0:  # left over from before the start
+                if count == 0 and t < 0:  # frame from before the start
                     if self._clock.now() > self._timeout_s:
                         raise HardwareError(
                             f"Camera {self._camera.name}: its clock is behind by {self._clock.now() - t:.3g} s; frames "
                             "cannot be placed in time."
                         )
                     continue
-                if count and t <= last:  # dropped silently, such frames would hide a gap
+                if count and t <= last:  # an error, since silently dropped frames would hide a gap
                     raise HardwareError(
                         f"Camera {self._camera.name}: its clock ran backwards by {last - t:.3f} s; frames cannot be placed "
                         "in time."
@@ -206,7 +206,7 @@ class _CameraRecorder:
                     self._fail(HardwareError(f"Camera {self._camera.name}: the disk cannot keep up; lower the frame rate."))
                     break
                 count += 1
-        except Exception as error:  # whatever a driver raises must end the capture, not only this thread
+        except Exception as error:  # any error of a driver must end the capture, not only this thread
             if not self._ending:
                 self._fail(_named(f"Camera {self._camera.name}", error))
         finally:
@@ -214,15 +214,15 @@ class _CameraRecorder:
             self._frames.put(None)
 
     def _is_due(self, t: float, interval: float) -> bool:
-        """Whether a frame is the nearest to the next moment at which one is to be written."""
+        """Whether this frame is the one nearest to the next time at which a frame should be written."""
         if t + interval / 2 < self._due:
             return False
-        late = t - self._due > self._period / 2  # the first one, or after a gap, whose missed moments are not made up for
+        late = t - self._due > self._period / 2  # first frame, or after a gap, whose missed frames are not made up for
         self._due = (t if late else self._due) + self._period
         return True
 
     def _queued(self, frame: CameraFrame) -> bool:
-        """Wait for the disk, but not longer than for the camera; whether there was room."""
+        """Queue a frame. Wait for the disk at most as long as for the camera, and return False if there is no room."""
         end = time.monotonic() + self._timeout_s
         while self._frames.qsize() >= _QUEUED_FRAMES:
             if time.monotonic() > end:
@@ -234,11 +234,11 @@ class _CameraRecorder:
     def _write(self) -> None:
         refused = False
         while (frame := self._frames.get()) is not None:
-            if refused:  # only empty the queue
+            if refused:  # after a failure, only empty the queue
                 continue
             try:
                 self._writer.add_frame(self._camera.name, self._clock.of(frame.time_s), frame.depth, frame.color)
-            except Exception as error:  # whatever an encoder or the disk raises
+            except Exception as error:  # any error of the encoder or the disk
                 refused = True
                 self._fail(_named(f"Camera {self._camera.name}, writing a frame", error))
 
@@ -277,10 +277,10 @@ class _ArmRecorder:
         ended = refused = False
         while not ended:
             rows = [self._rows.get()]
-            while not self._rows.empty():  # all that has come: the disk is waited for once
+            while not self._rows.empty():  # write all queued rows with a single fsync
                 rows.append(self._rows.get())
             ended = None in rows
-            if refused:  # only empty the queue
+            if refused:  # after a failure, only empty the queue
                 continue
             try:
                 self._writer.add_robot(*(row for row in rows if row is not None))
@@ -289,5 +289,5 @@ class _ArmRecorder:
 
 
 def _named(where: str, error: Exception) -> DiffCloudError:
-    """An error of this project; another one with its type, which a driver's text alone does not tell."""
+    """Return a DiffCloudError unchanged. Convert others, and add their type to the message."""
     return error if isinstance(error, DiffCloudError) else HardwareError(f"{where}: {type(error).__name__}: {error}")

@@ -69,7 +69,7 @@ class BoardSettings(Section):
     @field_validator("dictionary")
     @classmethod
     def _is_known(cls, dictionary: str) -> str:
-        import cv2  # not above: only a file that names a dictionary needs it
+        import cv2  # imported here, because only few files need it
 
         known = [name for name in dir(cv2.aruco) if name.startswith("DICT_")]
         if dictionary not in known:

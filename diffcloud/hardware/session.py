@@ -1,11 +1,11 @@
-"""One capture: cameras and arm at once, written while it runs, and the arm stopped whatever happens.
+"""One capture: record cameras and arm together, and stop the arm in all cases.
 
-The control loop (`motion`) runs in the caller's thread, threads of their own take and write what is recorded (`recorders`),
-and the arm's connection belongs to another process (`arm_process`). Whatever ends the loop (the end of the trajectory, a
-limit, a fault, a lost camera or connection, a full disk, a signal) goes through one `finally`, which sends Stop before
-anything else. Where this process cannot send it any more, the other one does.
+The control loop (`motion`) runs in the caller's thread. Other threads read and write the recorded data (`recorders`).
+The arm's connection belongs to another process (`arm_process`). The loop may end at the end of the trajectory, or by a
+limit, a fault, a lost device, a full disk or a signal. In each case, Stop is sent before anything else. If this process
+cannot send it, the arm's process does.
 
-Cameras and arm are the protocols in `devices`: `realsense`, `kinova` and `arm_process` keep them, tests bring others.
+Cameras and arm implement the protocols in `devices`.
 """
 
 from __future__ import annotations
@@ -39,14 +39,14 @@ Tell = Callable[[str], None]
 
 @dataclass(frozen=True)
 class CaptureReport:
-    """What a capture that ran to its end recorded."""
+    """Result of a complete capture."""
 
     folder: Path
     frames: dict[str, int]
     robot_rows: int
     seconds: float
     largest_error_m: float
-    """Of the tool against the trajectory, over all readings."""
+    """Largest distance between the tool and the trajectory [m]."""
 
 
 def capture(
@@ -67,20 +67,20 @@ def capture(
     """Record one raw episode.
 
     Args:
-        folder: of the episode; must not exist.
-        cameras: one or more, not yet open; they are closed at the end.
-        arm: connected, in a process of its own (`ArmProcess`); None to record cameras alone for `seconds`. It is stopped at
-            the end, and left connected.
-        robot: description of the arm with its tool; None for the package's own Gen3 with a 2F-85.
-        T_world_camera: by serial, where the cameras are calibrated.
-        tell: is called with what happens.
+        folder: folder of the episode. It must not exist.
+        cameras: at least one, not open yet. All are closed at the end.
+        arm: connected arm in its own process (`ArmProcess`), or None to record only cameras for `seconds`. It is
+            stopped at the end and stays connected.
+        robot: description of the arm with its tool. None: the package's own Gen3 with a 2F-85.
+        T_world_camera: serial number -> [4, 4] camera pose, for calibrated cameras.
+        tell: called with progress messages.
 
     Raises:
-        LimitError: the trajectory is refused before anything moves; or a limit was broken while moving.
-        UnconfirmedStopError: at the end the arm has not confirmed Stop, and may still be moving.
-        HardwareError: a camera or the arm failed. Frames so far are on disk, and Stop has been sent where a link exists.
+        LimitError: the trajectory was refused before the motion, or a limit was exceeded during the motion.
+        UnconfirmedStopError: the arm has not confirmed the final Stop, and may still be moving.
+        HardwareError: a camera or the arm failed. Frames so far are on disk, and Stop has been sent if a link exists.
         DiffCloudError: the disk refused a frame.
-        KeyboardInterrupt: Ctrl-C, Ctrl-Z, a termination signal, a closed terminal.
+        KeyboardInterrupt: Ctrl-C, Ctrl-Z, a termination signal, or a closed terminal.
     """
     limits, settings = limits or Limits(), settings or CaptureSettings()
     if not cameras:
@@ -94,13 +94,13 @@ def capture(
         )
     if trajectory is None and not (seconds is not None and seconds > 0):
         raise HardwareError("Without an arm, say how long to record: --seconds.")
-    # all that can be refused is refused before a camera is opened, and long before the arm moves
+    # Make all checks before a camera is opened, and long before the arm moves.
     if Path(folder).exists():
         raise exists_already(folder)
     if trajectory is not None:
         check_trajectory(trajectory, limits)
         check_control_rate(settings.rate_hz, settings.gain)
-    import_module("cv2")  # encodes the images; imported at the first of them it would hold the control loop up
+    import_module("cv2")  # encodes images; an import at the first image would delay the control loop
     opened: list[Camera] = []
     try:
         infos = {}
@@ -145,7 +145,7 @@ def capture(
                 except BaseException:
                     if arm is not None:
                         with interruption.held():
-                            _stop(arm, tell)  # at once; then there is time for the frames still in the queues
+                            _stop(arm, tell)  # first, then there is time to write queued frames
                     recorders.finish()
                     raise
                 recorders.finish()
@@ -154,12 +154,12 @@ def capture(
             return CaptureReport(writer.folder, writer.frame_counts, writer.robot_rows, clock.now(), largest)
     finally:
         for camera in opened:
-            with suppress(Exception):  # the next one must be closed whatever this driver raises
+            with suppress(Exception):  # close the other cameras even if this driver fails
                 camera.close()
 
 
 def _gen3() -> Robot:
-    from diffcloud.sensing.robot import gen3  # not above: `arm_limits` says why
+    from diffcloud.sensing.robot import gen3  # imported here because it imports torch
 
     return gen3()
 
@@ -171,7 +171,7 @@ def _placed(info: CameraInfo, poses: Mapping[str, Floats]) -> CameraInfo:
 
 
 def _drive(motion: Motion, follower: ToolFollower, recorders: Recorders, clock: Clock) -> None:
-    """Move along the trajectory, with the arm's log."""
+    """Execute the trajectory and log the arm."""
 
     def heard(moment: float, reading: ArmReading) -> None:
         recorders.raise_failure()
@@ -179,16 +179,16 @@ def _drive(motion: Motion, follower: ToolFollower, recorders: Recorders, clock: 
 
     run(motion, follower, start=clock.start, heard=heard)
     recorders.end_cameras()
-    # one row after the last image, so that every image lies between two rows
+    # Add a row after the last image, so that every image is between two rows.
     recorders.add_reading(clock.now(), motion.arm.read())
 
 
 @contextmanager
 def _stopping(arm: GuardedArm | None, tell: Tell) -> Iterator[Interruption]:
-    """Whatever leaves this block, Stop is sent first.
+    """Send Stop when this block ends in any way.
 
     Raises:
-        UnconfirmedStopError: nothing else was wrong, but the arm has not confirmed Stop.
+        UnconfirmedStopError: the arm has not confirmed Stop, and there was no other error.
     """
     with Interruption(lambda: None if arm is None else arm.halt()) as interruption:
         try:
@@ -204,7 +204,7 @@ def _stopping(arm: GuardedArm | None, tell: Tell) -> Iterator[Interruption]:
 
 
 def _stop(arm: GuardedArm, tell: Tell) -> None:
-    """Stop; what ends the capture already stays the error, so a Stop that fails is told."""
+    """Stop the arm. If this fails, only print the error, since another error is already ending the capture."""
     try:
         arm.stop()
     except HardwareError as error:

@@ -1,4 +1,4 @@
-"""How a capture runs."""
+"""Settings of a capture."""
 
 from __future__ import annotations
 
@@ -9,17 +9,17 @@ from diffcloud.hardware.trajectory import DEFAULT_GAIN
 
 @dataclass(frozen=True)
 class CaptureSettings:
-    """How a capture runs."""
+    """Settings of a capture."""
 
     rate_hz: float = 10.0
-    """Of control, and of the episode."""
+    """Rate of the control loop and of the episode."""
     frames_hz: float | None = None
-    """So many of a camera's frames are written in a second, evenly; None writes all."""
+    """Number of frames written per second and camera, evenly spaced. None writes all."""
     gain: float = DEFAULT_GAIN
     approach_speed_m_s: float = 0.1
-    """Of the tool on the way to the first keyframe, and of the arm's fastest point on the way home."""
+    """Speed of the tool during the approach, and of the arm's fastest point on the way home."""
     go_home: bool = False
     hold_s: float = 0.5
-    """Recorded at rest after the last keyframe."""
+    """Time at rest after the last keyframe that is recorded too."""
     camera_timeout_s: float = 1.0
     durable: bool = True

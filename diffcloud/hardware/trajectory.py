@@ -1,8 +1,8 @@
-"""Tool trajectories, the limits they must keep, and the controller that follows them with Cartesian velocities.
+"""Tool trajectories, their limits, and the velocity controller that follows them.
 
-The arm takes velocities, not positions: at each tick the command is the trajectory's own velocity plus a proportional
-correction of the position error, held within speed and acceleration limits. The reference sends 0.4 error / 0.1 s and no
-velocity of its own, which lags behind a moving target by a quarter of a second's motion; its gain is kept.
+At each tick, the controller sends the trajectory's velocity plus a proportional correction of the position error,
+limited in speed and acceleration. The reference implementation has the same gain, but no feed-forward velocity: it
+sends 0.4 error / 0.1 s, so it lags behind a moving target by 0.25 s.
 """
 
 from __future__ import annotations
@@ -20,29 +20,29 @@ from diffcloud.io.tables import numbers, read_csv
 Floats = NDArray[np.float64]
 
 DEFAULT_GAIN = 4.0
-"""1/s: the reference's 0.4 per 0.1 s."""
+"""Gain of the position error [1/s]. The reference has 0.4 per 0.1 s."""
 _APPROACH_RATE_HZ = 20.0
 
 
 @dataclass(frozen=True)
 class Limits:
-    """What the tool may do. The default box is the reference's workspace; its trajectories are faster than the default
-    speed, which is one that a person can react to."""
+    """Limits of the tool. The default box is the reference's workspace. The default speed is lower than the
+    reference's, so that a person can react."""
 
     box_low_m: tuple[float, float, float] = (0.40, -0.36, 0.055)
     box_high_m: tuple[float, float, float] = (0.95, 0.36, 0.95)
     speed_m_s: float = 0.1
     acceleration_m_s2: float = 2.5
     force_N: float = 30.0
-    """Of the external wrench at the tool, beyond what it was at rest."""
+    """Largest change of the external force at the tool since rest."""
     torque_Nm: float = 10.0
     preload_N: float = 15.0
-    """Of the external wrench at rest: more is no offset of the estimate, but something that the tool presses on."""
+    """Largest external force at rest. A larger one is contact, not an offset of the estimate."""
     preload_Nm: float = 5.0
     tracking_error_m: float = 0.08
-    """Farther from the trajectory than this, something holds the arm."""
+    """Largest distance from the trajectory. A larger one means that something blocks the arm."""
     box_slack_m: float = 0.01
-    """The measured tool may leave the box by this much, since a controller overshoots."""
+    """Tolerance of the box for the measured tool position, since a controller overshoots."""
 
     def __post_init__(self) -> None:
         if not (np.array(self.box_low_m) < self.box_high_m).all():
@@ -53,17 +53,17 @@ class Limits:
                 raise LimitError(f"The limit {name} must be positive, got {getattr(self, name)}.")
 
     def outside(self, positions: Floats, slack_m: float = 0.0) -> NDArray[np.bool_]:
-        """Which positions [..., 3] leave the box by more than `slack_m`."""
+        """Mask of positions [..., 3] that are outside the box by more than `slack_m`."""
         low, high = np.array(self.box_low_m) - slack_m, np.array(self.box_high_m) + slack_m
         return np.asarray(~((positions >= low) & (positions <= high)).all(axis=-1))
 
 
 @dataclass(frozen=True)
 class ToolTrajectory:
-    """Keyframes of the tool, joined by straight lines.
+    """Keyframes of the tool, connected by straight lines.
 
     Raises:
-        HardwareError: fewer than two keyframes, times that do not increase from 0, or numbers that are not finite.
+        HardwareError: there are fewer than two keyframes, times do not increase from 0, or numbers are not finite.
     """
 
     times: Floats
@@ -71,7 +71,7 @@ class ToolTrajectory:
     positions: Floats
     """[T, 3] in the robot's base frame [m]."""
     gripper: Floats | None = None
-    """[T] 0 open to 1 closed."""
+    """[T] from 0 (open) to 1 (closed)."""
 
     def __post_init__(self) -> None:
         count = len(self.times)
@@ -93,23 +93,23 @@ class ToolTrajectory:
         return float(self.times[-1])
 
     def position(self, t_s: float) -> Floats:
-        """[3] where the tool should be; the ends are held."""
+        """[3] desired tool position. Before the start and after the end, the position at the ends."""
         return np.array([np.interp(t_s, self.times, self.positions[:, axis]) for axis in range(3)])
 
     def gripper_at(self, t_s: float) -> float | None:
-        """Of the last keyframe that has passed: a gripper closes at once, not over seconds."""
+        """Gripper state of the last keyframe that has passed. It changes at once, without interpolation."""
         if self.gripper is None:
             return None
         return float(self.gripper[max(0, int(np.searchsorted(self.times, t_s + 1e-9, side="right")) - 1)])
 
     @property
     def velocities(self) -> Floats:
-        """[T - 1, 3] of the segments [m/s]."""
+        """[T - 1, 3] velocities of the segments [m/s]."""
         return np.diff(self.positions, axis=0) / np.diff(self.times)[:, None]
 
     @property
     def accelerations(self) -> Floats:
-        """[T, 3] at the keyframes, from rest and to rest, spread over the segments beside them [m/s²]."""
+        """[T, 3] accelerations averaged around each keyframe, from rest and to rest [m/s²]."""
         velocity = np.concatenate([np.zeros((1, 3)), self.velocities, np.zeros((1, 3))])
         span = np.diff(self.times)
         beside = np.concatenate([span[:1], (span[:-1] + span[1:]) / 2, span[-1:]])
@@ -117,10 +117,10 @@ class ToolTrajectory:
 
 
 def check_trajectory(trajectory: ToolTrajectory, limits: Limits) -> None:
-    """Refuse a motion before it starts.
+    """Check a trajectory against the limits of the tool.
 
     Raises:
-        LimitError: a keyframe outside the box, or too much speed or acceleration; names keyframe, value and limit.
+        LimitError: a keyframe is outside the box, or speed or acceleration is too high.
     """
     outside = np.flatnonzero(limits.outside(trajectory.positions))
     if len(outside):
@@ -152,10 +152,10 @@ def check_trajectory(trajectory: ToolTrajectory, limits: Limits) -> None:
 
 
 def check_control_rate(rate_hz: float, gain: float = DEFAULT_GAIN) -> None:
-    """Refuse a control rate at which the correction of an error is larger than twice the error.
+    """Refuse a control rate at which the correction overshoots by more than the error, which is unstable.
 
     Raises:
-        LimitError: says which rates and gains are stable.
+        LimitError: the message lists stable rates and gains.
     """
     if not gain < 2 * rate_hz:
         raise LimitError(
@@ -165,11 +165,11 @@ def check_control_rate(rate_hz: float, gain: float = DEFAULT_GAIN) -> None:
 
 
 def approach(start: Floats, goal: Floats, *, speed_m_s: float) -> ToolTrajectory | None:
-    """A straight minimum-jerk motion from `start` to `goal` [3] that peaks at `speed_m_s`; None where they are one."""
+    """Plan a straight minimum-jerk motion from `start` to `goal` [3] with peak `speed_m_s`. None if they coincide."""
     distance = float(np.linalg.norm(goal - start))
     if distance < 1e-3:
         return None
-    duration = max(1.875 * distance / speed_m_s, 0.5)  # 15/8: peak over mean speed of minimum jerk
+    duration = max(1.875 * distance / speed_m_s, 0.5)  # 15/8: ratio of peak to mean speed of a minimum-jerk motion
     times = np.linspace(0.0, duration, max(3, round(duration * _APPROACH_RATE_HZ) + 1))
     s = times / duration
     along = s**3 * (10 - 15 * s + 6 * s**2)
@@ -177,7 +177,7 @@ def approach(start: Floats, goal: Floats, *, speed_m_s: float) -> ToolTrajectory
 
 
 class VelocityController:
-    """Closed loop: positions in, velocities out, one call per tick."""
+    """Closed-loop controller: maps measured positions to velocities, with one call per tick."""
 
     def __init__(self, trajectory: ToolTrajectory, limits: Limits, *, period_s: float, gain: float = DEFAULT_GAIN) -> None:
         check_control_rate(1 / period_s, gain)
@@ -185,8 +185,8 @@ class VelocityController:
         self._last = np.zeros(3)
 
     def velocity(self, t_s: float, position: Floats) -> Floats:
-        """[3] to command at `t_s` for a tool measured at `position` [3] [m/s]."""
-        # the velocity of the coming period, not of this instant: it is held until the next tick
+        """Return the velocity command [3] [m/s] at `t_s` for a tool measured at `position` [3]."""
+        # Use the mean velocity over the next period, because the command is valid until the next tick.
         ahead = self._trajectory.position(t_s + self._period)
         here = self._trajectory.position(t_s)
         wanted = (ahead - here) / self._period + self._gain * (here - position)
@@ -196,16 +196,15 @@ class VelocityController:
 
 
 def read_trajectory(path: Path, *, rate_hz: float = 10.0, stretch_time: float = 1.0) -> ToolTrajectory:
-    """Keyframes from a file.
+    """Read keyframes from a file.
 
     Args:
-        path: CSV with the columns x, y, z [m] and optionally t_s [s] and gripper; or NPY [T, 3], as the published
-            trajectories are.
-        rate_hz: of keyframes without times.
-        stretch_time: 2 makes the motion half as fast.
+        path: CSV file with columns x, y, z [m], optionally t_s [s] and gripper. Or an NPY file [T, 3], as published.
+        rate_hz: rate of the keyframes if the file has no times.
+        stretch_time: factor on the times. With 2, the motion is half as fast.
 
     Raises:
-        HardwareError: missing, not numbers, or no trajectory.
+        HardwareError: the file is missing, has no numbers, or is not a valid trajectory.
     """
     path = Path(path)
     if stretch_time <= 0 or rate_hz <= 0:

@@ -1,4 +1,4 @@
-"""From recordings of a cloth to its parameters: what is assumed where nobody says otherwise."""
+"""Default assumptions for estimating the parameters of a cloth from recordings."""
 
 from diffcloud.identification.hanging import HANG_FIELDS, find_hanging, prepared
 from diffcloud.identification.protocol import (

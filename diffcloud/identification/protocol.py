@@ -1,4 +1,4 @@
-"""The cloth and the settings of a fit that the command `fit` and the library begin with, each with its reason."""
+"""Default cloth and fit settings of the command `fit` and the library, each with its reason."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _MATERIAL = {"stretching_n_m": 60.0, "bending_n_m": 5e-6, "poisson": 0.2, "dampi
 _AROUND = {"friction": 0.4, "compression": 0.5}
 _UNCERTAIN = {"friction": 2.0, "compression": 3.0, "shear": 1.2, "damping": 2.5}
 _BOUNDS = {"stretching": (0.03, 30.0), "bending": (0.03, 30.0), "density": (0.2, 5.0)}
-"""Multiples of the nominal material."""
+"""Search ranges as multiples of the nominal material."""
 _HANGING_UNCERTAIN = {
     "compression": 3.0,
     "shear": 1.2,
@@ -39,11 +39,11 @@ _GRIP_KNOWN = 1.5
 def found_cloth(
     episodes: Sequence[Episode], size: tuple[float, float] | None = None, density: float | None = None
 ) -> dict[str, Found]:
-    """Fields of a scenario that all recordings of one cloth share, each with its reason.
+    """Return the scenario fields that all recordings of one cloth share, each with its reason.
 
     Args:
-        size: sides [m]; by default as the first frames show them.
-        density: weighed [kg/m²].
+        size: side lengths [m]. Default: estimated from the first frames.
+        density: measured mass per area [kg/m²].
     """
     hanging = [hangs(episode) for episode in episodes]
     if any(hanging) and not all(hanging):
@@ -89,10 +89,10 @@ def found_cloth(
 
 
 def with_material_path(fields: Mapping[str, Any], folder: Path) -> dict[str, Any]:
-    """Fields of a scenario's file for one in another folder: the file of its material, if it names one, by its whole path.
+    """Return the fields of a scenario file with the absolute path of its material file, for use in another folder.
 
     Args:
-        folder: of the file.
+        folder: folder of the scenario file.
     """
     material = fields.get("material")
     if not (isinstance(material, str) and material.endswith(".json")):
@@ -101,12 +101,12 @@ def with_material_path(fields: Mapping[str, Any], folder: Path) -> dict[str, Any
 
 
 def known_grip(size: float) -> dict[str, float]:
-    """Fields of a cloth whose grasp has this size for certain [m]."""
+    """Return the scenario fields of a grasp with exactly known size [m]."""
     return {"grip_m": size, "grip_known_within": 1.0}
 
 
 def with_density(cloth: Mapping[str, Any], density: float, deviation: float) -> dict[str, Any]:
-    """The cloth with a weighed mass that is not exact: the fit allows for it."""
+    """Return the cloth with a measured density and its standard deviation [kg/m²], which the fit takes into account."""
     material = {**_material(cloth), "density_kg_m2": density}
     return {**cloth, "material": material, "uncertain": {**cloth.get("uncertain", {}), "density": 1 + deviation / density}}
 
@@ -124,14 +124,13 @@ def fit_settings(
     weighed: tuple[float, float] | None,
     base: FitSettings | None = None,
 ) -> FitSettings:
-    """Settings of the fit of such a cloth.
+    """Return the settings of a fit.
 
     Args:
-        parameters: to find; by default stretching, bending, and the mass if it was not weighed.
-        scenario: of a cloth of `found_cloth`.
+        parameters: parameters to estimate. Default: stretching, bending, and the density if it was not measured.
+        scenario: scenario of a cloth as `found_cloth` returns it.
         weighed: density and its standard deviation [kg/m²].
-        base: what else is said; its parameters, bounds and fixed values come first.
-
+        base: other settings. Its parameters, bounds and fixed values take precedence.
     """
     names = ["stretching", "bending", *(["density"] if weighed is None else [])]
     if parameters is not None:

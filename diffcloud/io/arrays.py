@@ -1,4 +1,4 @@
-"""Files of arrays, NPZ and NPY, from others: what a file says of itself is checked before memory is taken for it."""
+"""Read NPZ and NPY files from untrusted sources. Headers are checked before memory is allocated."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from diffcloud.errors import DiffCloudError
 from diffcloud.io.inputs import MOST_BYTES, check_size, open_input
 
 ELEMENTS = "biufSU"
-"""Kinds of elements that are read: numbers and strings; an object would be a pointer."""
+"""Accepted kinds of elements: numbers and strings. Objects are refused."""
 MOST_DIMENSIONS = 8
 _PIECE = 16 << 20
-"""Bytes that are unpacked at a time, into their place: no array is in memory twice."""
+"""Number of bytes decompressed at a time, directly into the array, so that no array is in memory twice."""
 
 
 def read_npz(
@@ -32,21 +32,21 @@ def read_npz(
     names: Collection[str] | None = None,
     most_bytes: int = MOST_BYTES,
 ) -> dict[str, NDArray[Any]]:
-    """Name -> array.
+    """Read arrays by name.
 
     Args:
-        kind: what the file is, for messages: "episode".
-        names: of the arrays that are read; all of them where not given.
+        kind: kind of file, for messages, such as "episode".
+        names: arrays to read, by default all.
 
     Raises:
-        error: missing, no regular file, damaged, encrypted, too large before or after it is unpacked, with two arrays of
-            one name, without one of the names, or with elements that are no numbers or strings.
+        error: the file is missing, not a regular file, damaged, encrypted, or too large (compressed or decompressed).
+            Also if an array is missing, occurs twice, or has elements other than numbers and strings.
     """
     path = Path(path)
     try:
         with open_input(path, kind=kind, error=error, most_bytes=most_bytes) as file, zipfile.ZipFile(file) as archive:
             entries = archive.infolist()
-            # a file that unpacks to more than its directory states ends there: zipfile reads no further
+            # The stated sizes can be trusted: zipfile stops at the size in the directory.
             size = sum(entry.file_size for entry in entries)
             check_size(path, size, kind, error, most_bytes, says="unpacks to")
             held = {entry.filename.removesuffix(".npy"): entry for entry in entries}
@@ -61,20 +61,19 @@ def read_npz(
                 with archive.open(held[name]) as stream:
                     found[name] = _array(cast(BinaryIO, stream), held[name].file_size, name)
             return found
-    # zipfile says of what it does not know that it is not implemented, and of an encrypted entry that a password is
-    # missing (RuntimeError)
+    # zipfile raises NotImplementedError for unknown compression, and RuntimeError for encrypted entries.
     except (zipfile.BadZipFile, zlib.error, NotImplementedError, RuntimeError, ValueError, OSError, EOFError) as damage:
         raise error(f"{path} is not a readable {kind}: {damage}.") from damage
 
 
 def read_npy(path: Path, *, kind: str, error: type[DiffCloudError], most_bytes: int = MOST_BYTES) -> NDArray[Any]:
-    """The array of one file.
+    """Read the array of one NPY file.
 
     Args:
-        kind: as of `read_npz`.
+        kind: kind of file, for messages.
 
     Raises:
-        error: missing, damaged, too large, or with elements that are no numbers or strings.
+        error: the file is missing, damaged, too large, or has elements other than numbers and strings.
     """
     path = Path(path)
     try:
@@ -85,10 +84,10 @@ def read_npy(path: Path, *, kind: str, error: type[DiffCloudError], most_bytes: 
 
 
 def _array(stream: BinaryIO, size: int, name: str) -> NDArray[Any]:
-    """One array, of a stream with so many bytes.
+    """Read one array from a stream of `size` bytes.
 
     Raises:
-        ValueError: its header is none, or states more or less than there is.
+        ValueError: the header is invalid, or does not match the number of bytes.
     """
     try:
         shape, fortran, dtype = npy_header(stream)
@@ -99,7 +98,7 @@ def _array(stream: BinaryIO, size: int, name: str) -> NDArray[Any]:
     there = size - stream.tell()
     if len(shape) > MOST_DIMENSIONS or any(extent < 0 for extent in shape):
         raise ValueError(f"{name} has the shape {list(shape)}")
-    stated = math.prod(shape) * dtype.itemsize  # of Python's numbers, which do not overflow
+    stated = math.prod(shape) * dtype.itemsize  # Python integers do not overflow
     if stated != there:
         raise ValueError(f"{name} states {stated} bytes and has {there}")
     flat: NDArray[Any] = np.empty(math.prod(shape), dtype)
@@ -113,20 +112,20 @@ def _array(stream: BinaryIO, size: int, name: str) -> NDArray[Any]:
 
 
 def readable(dtype: np.dtype[Any]) -> bool:
-    """Whether elements are numbers, or text of a letter or more: a small file may state any number of elements without
-    bytes, and numpy takes memory for each."""
+    """Check that elements are numbers or non-empty strings. A small file may state any number of zero-byte elements,
+    for each of which numpy would allocate memory."""
     return not dtype.hasobject and dtype.kind in ELEMENTS and dtype.itemsize > 0
 
 
 def npy_header(stream: BinaryIO) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
-    """(shape, whether in Fortran's order, elements) of an array that begins here.
+    """Read the header of an array: shape, whether in Fortran order, and element type.
 
     Raises:
-        ValueError: there is no header.
+        ValueError: there is no valid header.
     """
     try:
         version = np.lib.format.read_magic(stream)
         read_header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
         return read_header(stream)
-    except Exception as damage:  # numpy parses the header as Python, which fails in many ways where it is damaged
+    except Exception as damage:  # numpy parses the header as Python code; damage raises many types of errors
         raise ValueError(str(damage)) from damage

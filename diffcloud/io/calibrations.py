@@ -1,8 +1,8 @@
-"""Calibration files: where each camera stands in the robot's base frame, how surely, and how that was found.
+"""Read and write calibration files: pose of each camera in the robot's base frame, covariance and residuals.
 
-`raw/calibration/<name>.json`: cameras by serial, each with intrinsics, `T_world_camera` (4 x 4, maps camera points to world
-points, metres) and a 6 x 6 covariance of (translation [m], rotation [rad]), perturbations on the world's side:
-T = (exp(rotation) R, translation + t).
+`raw/calibration/<name>.json` lists cameras by serial number. Each has intrinsics, `T_world_camera` (4 x 4, maps camera
+points to world points [m]) and a 6 x 6 covariance of (translation [m], rotation vector [rad]). Perturbations are on the
+world side: T = (exp(rotation) R, translation + t).
 """
 
 from __future__ import annotations
@@ -28,39 +28,39 @@ Text = Annotated[str, Field(max_length=10_000)]
 
 @dataclass(frozen=True)
 class CameraCalibration:
-    """One camera's place."""
+    """Calibration of one camera."""
 
     serial: str
     intrinsics: Intrinsics
     T_world_camera: NDArray[np.float64]
     """[4, 4] maps camera points to world points [m]."""
     covariance: NDArray[np.float64] | None = None
-    """[6, 6] of translation [m] and rotation vector [rad], on the world's side; None where the method gives none."""
+    """[6, 6] covariance of translation [m] and rotation vector [rad], on the world side. None if unknown."""
     name: str = ""
-    """What the person calls it: overhead, side."""
+    """User's name of the camera, such as overhead or side."""
     residuals: Mapping[str, float] = field(default_factory=dict)
-    """What the method measures. charuco: rms_px and rms_mm on held-out poses, rms_fit_px, rms_fit_mm. checkerboard: rms_mm
-    of the fit, held_out_mm on corners left out."""
+    """Errors of the method. charuco: rms_px, rms_mm (held-out poses), rms_fit_px, rms_fit_mm. checkerboard: rms_mm (of
+    the fit), held_out_mm (held-out corners)."""
 
 
 @dataclass(frozen=True)
 class Calibration:
-    """All cameras of one set-up."""
+    """Calibration of all cameras of a setup."""
 
     cameras: Mapping[str, CameraCalibration]
-    """By serial."""
+    """Serial number -> calibration."""
     method: str
     board: Mapping[str, Any] = field(default_factory=dict)
     date: str = ""
     """ISO 8601."""
     objections: tuple[str, ...] = ()
-    """Why it should not be used; it was written all the same, by force."""
+    """Failed quality checks. A calibration with failed checks is written only if the user forces it."""
 
     def camera(self, serial: str, *, name: str = "") -> CameraCalibration:
-        """The calibration of one camera.
+        """Return the calibration of one camera.
 
         Raises:
-            CalibrationError: this file is of other cameras.
+            CalibrationError: the file does not have this camera.
         """
         if serial not in self.cameras:
             label = f"{name} (serial {serial})" if name else f"serial {serial}"
@@ -73,9 +73,10 @@ class Calibration:
 
 
 def _covariance(rows: list[list[float]]) -> list[list[float]]:
-    """
+    """Return a valid covariance.
+
     Raises:
-        ValueError: not 6 x 6, not symmetric, or with negative variances.
+        ValueError: the matrix is not 6 x 6, not symmetric, or has negative variances.
     """
     matrix = square(rows, 6)
     scale = float(np.abs(matrix).max())
@@ -85,7 +86,7 @@ def _covariance(rows: list[list[float]]) -> list[list[float]]:
 
 
 class CameraFile(Checked):
-    """One camera of a calibration file."""
+    """Schema of one camera in a calibration file."""
 
     name: Text = ""
     intrinsics: IntrinsicsFile
@@ -95,7 +96,7 @@ class CameraFile(Checked):
 
 
 class CalibrationFile(Checked):
-    """A calibration file."""
+    """Schema of a calibration file."""
 
     schema_version: Literal[1]
     method: Text
@@ -108,7 +109,7 @@ class CalibrationFile(Checked):
 
 
 def write_calibration(path: Path, calibration: Calibration) -> None:
-    """Write atomically, as JSON."""
+    """Write a calibration file (JSON) atomically."""
     cameras = {
         serial: {
             "name": camera.name,
@@ -136,10 +137,10 @@ def write_calibration(path: Path, calibration: Calibration) -> None:
 
 
 def read_calibration(path: Path) -> Calibration:
-    """Read and check.
+    """Read and check a calibration file.
 
     Raises:
-        CalibrationError: missing, damaged, of another version, or with a matrix that is no rigid transform.
+        CalibrationError: the file is missing or damaged, has another version, or a matrix is not a rigid transform.
     """
     try:
         told = CalibrationFile.model_validate(read_json(Path(path), error=CalibrationError))

@@ -1,4 +1,4 @@
-"""How files describe a camera: its intrinsics and its place, checked on the way in."""
+"""Camera intrinsics and poses in files, and their validation."""
 
 from __future__ import annotations
 
@@ -15,23 +15,24 @@ from diffcloud.io.schema import Checked, Component
 Pixels = Annotated[int, Field(ge=1, le=20_000)]
 
 Distortion = Literal["none", "brown_conrady", "inverse_brown_conrady", "equidistant"]
-"""`brown_conrady`: OpenCV's, from rays to pixels. `inverse_brown_conrady`: the same polynomial from pixels to rays, which
-RealSense colour cameras state (mostly with zeros). `equidistant`: OpenCV's fisheye, from rays to pixels."""
+"""Lens distortion models. `brown_conrady`: OpenCV's polynomial from rays to pixels. `inverse_brown_conrady`: the same
+polynomial from pixels to rays, as in RealSense colour cameras (mostly all zero). `equidistant`: OpenCV's fisheye
+model."""
 LENS_COEFFICIENTS: dict[Distortion, tuple[int, ...]] = {
     "none": (),
     "brown_conrady": (5, 8, 12, 14),
     "inverse_brown_conrady": (5,),
     "equidistant": (4,),
 }
-"""How many coefficients a model may have."""
+"""Allowed numbers of coefficients of each model."""
 
 
 @dataclass(frozen=True)
 class Intrinsics:
-    """A pinhole camera with OpenCV's frame: x right, y down, z forward; pixel centres at whole numbers.
+    """Pinhole camera with OpenCV's axes (x right, y down, z forward). Pixel centres have whole coordinates.
 
     Raises:
-        EpisodeError: a number that no camera has.
+        EpisodeError: a value is impossible for a camera.
     """
 
     width: int
@@ -42,8 +43,8 @@ class Intrinsics:
     cy: float
     distortion: Distortion = "none"
     coefficients: tuple[float, ...] = ()
-    """In OpenCV's order: (k1, k2, p1, p2, k3), of brown_conrady also with k4..k6 (rational), s1..s4 (thin prism), and the
-    tilt of the sensor tau_x, tau_y [rad]; of equidistant (k1, k2, k3, k4)."""
+    """In OpenCV's order. brown_conrady: k1, k2, p1, p2, k3, then optional k4 to k6 (rational), s1 to s4 (thin prism),
+    and sensor tilt tau_x, tau_y [rad]. equidistant: k1 to k4."""
 
     def __post_init__(self) -> None:
         if self.distortion not in get_args(Distortion):
@@ -72,11 +73,12 @@ class Intrinsics:
 
     @property
     def matrix(self) -> NDArray[np.float64]:
-        """[3, 3]."""
+        """[3, 3] camera matrix in pixels."""
         return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
 
     def same_camera(self, other: Intrinsics) -> bool:
-        """Whether both can describe one camera at one resolution: focal lengths within 1 %, principal point within 5 px."""
+        """Whether both may be one camera at the same resolution: focal lengths within 1 %, principal point within 5
+        px."""
         return (
             (self.width, self.height) == (other.width, other.height)
             and abs(self.fx / other.fx - 1) < 0.01
@@ -89,7 +91,7 @@ class Intrinsics:
 
 
 class IntrinsicsFile(Checked):
-    """`Intrinsics` as files state them."""
+    """Schema of `Intrinsics` in files."""
 
     width: Pixels
     height: Pixels
@@ -113,10 +115,10 @@ class IntrinsicsFile(Checked):
 
 
 def square(rows: list[list[float]], size: int) -> NDArray[np.float64]:
-    """[n, n] of rows.
+    """Convert rows to a square matrix [size, size].
 
     Raises:
-        ValueError: another shape.
+        ValueError: the shape is different.
     """
     if len(rows) != size or any(len(row) != size for row in rows):
         raise ValueError(f"it must be {size} x {size} numbers")
@@ -124,9 +126,10 @@ def square(rows: list[list[float]], size: int) -> NDArray[np.float64]:
 
 
 def _rigid(rows: list[list[float]]) -> list[list[float]]:
-    """
+    """Return the rows of a valid rigid transform.
+
     Raises:
-        ValueError: not 4 x 4, not a rotation, or a translation of more than 20 m (millimetres).
+        ValueError: the matrix is not 4 x 4, not a rotation, or translates by more than 20 m (probably millimetres).
     """
     matrix = square(rows, 4)
     rotation = matrix[:3, :3]
@@ -139,4 +142,4 @@ def _rigid(rows: list[list[float]]) -> list[list[float]]:
 
 
 RigidTransform = Annotated[list[list[Component]], AfterValidator(_rigid)]
-"""[4, 4], from camera to world [m]."""
+"""[4, 4] camera-to-world transform [m]."""

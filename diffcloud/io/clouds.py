@@ -1,4 +1,4 @@
-"""Cloud files of other tools: NPY, PLY, XYZ, PCD; and open3d, which is imported only where it is used."""
+"""Read and write cloud files of other tools: NPY, PLY, XYZ and PCD. open3d is imported only on demand."""
 
 from __future__ import annotations
 
@@ -20,11 +20,12 @@ from diffcloud.io.ply import read_ply
 
 
 def read_cloud(path: Path) -> NDArray[np.float32]:
-    """[N, 3] points of one file. Colours, normals and further columns are left out, and so are points that are NaN or
-    infinite, which stand for pixels without depth.
+    """Read the points [N, 3] of a cloud file, without colours, normals and other columns.
+
+    NaN and infinite points are left out: they stand for pixels without depth.
 
     Raises:
-        EpisodeError: missing, damaged, without any point (`EmptyCloudError`), or of the wrong shape.
+        EpisodeError: the file is missing, damaged, without any point (`EmptyCloudError`), or of the wrong shape.
     """
     path = Path(path)
     check_input(path, kind="cloud", error=EpisodeError)
@@ -53,7 +54,7 @@ def write_ply(path: Path, vertices: NDArray[Any], faces: NDArray[Any] | None = N
 def _read_xyz(path: Path) -> NDArray[Any]:
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", UserWarning)  # of a file without rows
+            warnings.simplefilter("ignore", UserWarning)  # numpy warns about a file without rows
             table = np.loadtxt(path, ndmin=2)
     except (ValueError, UnicodeDecodeError) as error:
         raise EpisodeError(f"{path} is not a readable XYZ file (three or more numbers a line): {error}.") from error
@@ -61,20 +62,20 @@ def _read_xyz(path: Path) -> NDArray[Any]:
 
 
 FORMATS: dict[str, Callable[[Path], Any]] = {".npy": load_npy, ".ply": read_ply, ".xyz": _read_xyz, ".pcd": read_pcd}
-"""Suffix -> reader. Not .csv: tracks and time stamps lie beside clouds."""
+"""Suffix -> reader. CSV is not a cloud format, because tracks and time stamps in the same folder are CSV files."""
 
 
 def import_open3d() -> Any:
-    """open3d, with libusb found where the system has none.
+    """Import open3d. If the system has no libusb, the one of libusb-package is loaded first.
 
     Raises:
-        EpisodeError: open3d cannot be imported; says what to install.
+        EpisodeError: open3d cannot be imported. The message lists what to install.
     """
     try:
         load_libusb()
         import open3d
     except (ImportError, OSError) as error:
-        if isinstance(error.__cause__ or error.__context__, KeyboardInterrupt):  # as libraries in C report a Ctrl-C
+        if isinstance(error.__cause__ or error.__context__, KeyboardInterrupt):  # C libraries report Ctrl-C like this
             raise KeyboardInterrupt from error
         raise EpisodeError(
             f"open3d cannot be imported ({error}). On Debian: apt-get install libgl1 libegl1 libx11-6 libudev1 libgomp1."

@@ -1,9 +1,9 @@
-"""Folders of PNG depth images and a JSON of the camera, as simple recorders and Open3D write them.
+"""Import folders of PNG depth images with a camera JSON, as Open3D and simple recorders write them.
 
-<folder>/depth/*.png    16-bit, numbered or named by time (`io.frame_names`)
-<folder>/color/*.png or *.jpg    optional, same numbers; of times, the nearest
-<folder>/camera.json    as in raw episodes, or Open3D's {width, height, intrinsic_matrix (column-major), depth_scale}
-<folder>/timestamps.csv frame, t_s                optional; else names are times, or the rate is given
+<folder>/depth/*.png            16-bit, named by frame number or by time (`io.frame_names`)
+<folder>/color/*.png or *.jpg   optional; same frame numbers, or the nearest times
+<folder>/camera.json            as in raw episodes, or Open3D's {width, height, intrinsic_matrix (column-major),
+depth_scale} <folder>/timestamps.csv         frame, t_s; optional if names are times or the frame rate is given
 """
 
 from __future__ import annotations
@@ -31,15 +31,15 @@ _JSON_NAMES = ("camera.json", "intrinsics.json", "camera_intrinsic.json", "intri
 
 
 def depth_folders(folders: Mapping[str, Path], *, rate_hz: float | None = None) -> Recording:
-    """A recording from one folder per camera.
+    """Build a recording from one folder per camera.
 
     Args:
-        folders: by the camera's name.
-        rate_hz: of frames without timestamps.csv whose names are no times.
+        folders: camera name -> folder.
+        rate_hz: frame rate, if there is no timestamps.csv and names are not times.
 
     Raises:
-        EpisodeError: no images, no camera JSON, gaps in the numbers, JPEG depth, no times, times in two places that
-            disagree, times that run backwards, or a rate that is none.
+        EpisodeError: images, camera JSON, times or frame numbers are missing, or depth is JPEG. Also if times do not
+            increase or contradict each other, or the rate is invalid.
     """
     cameras = {name: _camera(Path(folder), name) for name, folder in folders.items()}
     named = {name: named_frames(Path(folder) / "depth", _IMAGES, kind="images") for name, folder in folders.items()}
@@ -76,7 +76,7 @@ def _camera(folder: Path, name: str) -> CameraInfo:
 
 
 class _OwnCamera(CameraFile):
-    """camera.json as in raw episodes; its folder names the camera where it does not say its serial number."""
+    """Schema of `camera.json` as in raw episodes. The default serial number is the folder's camera name."""
 
     serial: Name | None = None  # type: ignore[assignment]
 
@@ -85,16 +85,16 @@ class _OwnCamera(CameraFile):
 
 
 class _Open3DCamera(BaseModel):
-    """Other fields, of which Open3D writes many, are not looked at."""
+    """Schema of Open3D's camera JSON. Other fields are ignored."""
 
     model_config = ConfigDict(frozen=True, extra="ignore", allow_inf_nan=False)
 
     width: Pixels
     height: Pixels
     intrinsic_matrix: Annotated[list[Component], Field(min_length=9, max_length=9)]
-    """Column by column."""
+    """Nine numbers in column-major order."""
     depth_scale: Annotated[float, Field(ge=50, le=1e6)] = 1000.0
-    """Units per metre."""
+    """Depth units per metre."""
     serial_number: Name | None = None
 
     @model_validator(mode="after")
@@ -143,7 +143,7 @@ def _times(folder: Path, named: NamedFrames, rate_hz: float | None) -> dict[int,
 
 
 def _colors(folder: Path, camera: str, depth: NamedFrames) -> tuple[dict[int, Path], tuple[str, ...]]:
-    """(number of a depth image -> colour image, some or all may be missing; warnings)."""
+    """Return (depth image number -> colour image, warnings). Colour may be missing for some or all depth images."""
     if not files_in(folder / "color", *_IMAGES):
         return {}, ()
     held = named_frames(folder / "color", _IMAGES, kind="images", gaps=True)
@@ -162,7 +162,10 @@ def _colors(folder: Path, camera: str, depth: NamedFrames) -> tuple[dict[int, Pa
 def _aligned_colors(
     cameras: Mapping[str, CameraInfo], colors: Mapping[str, dict[int, Path]]
 ) -> tuple[dict[str, dict[int, Path]], list[str]]:
-    """Colour images of depth's size, by the first of each camera, and a warning of each camera that has others."""
+    """Drop colour images whose size differs from depth, and return a warning for each such camera.
+
+    Only the first image of each camera is checked.
+    """
     aligned, warnings = dict(colors), list[str]()
     for name, images in colors.items():
         size = (cameras[name].intrinsics.height, cameras[name].intrinsics.width)

@@ -1,9 +1,9 @@
-"""Episodes: recorded point clouds over time, as one `.npz` without pickles.
+"""Episodes: recorded point clouds over time, stored as one `.npz` file without pickles.
 
-Fields: `points` float32 [P, 3] of all frames joined, `offsets` int64 [T+1], `times` [T] since the start [s], optional
-`gripper` [T, G, 3] of the `grippers` [G] (names), optional per-point `camera` uint8, `pixel` uint16 [P, 2], `sigma`
-float32 [P] [m], optional `lost` uint8 [T, C, bytes], and `meta`, a JSON string. All in the frame and length unit of the
-scenario's scene.
+P points, T frames, G grippers, C cameras. Fields: `points` float32 [P, 3] (all frames concatenated), `offsets` int64
+[T+1], `times` [T] [s] since the start, and `meta`, a JSON string. Optional: `gripper` [T, G, 3], `grippers` [G]
+(names), `camera` uint8 [P], `pixel` uint16 [P, 2], `sigma` float32 [P] [m], and `lost` uint8 [T, C, bytes]. Positions
+are in the frame and length unit of the scene.
 """
 
 from __future__ import annotations
@@ -25,37 +25,38 @@ from diffcloud.io.files import write_npz
 _OPTIONAL = {"gripper", "grippers", "camera", "pixel", "sigma", "lost"}
 _REQUIRED = {"points", "offsets", "times", "meta"}
 ONLY_GRIPPER = ("gripper",)
-"""The name of a single one."""
+"""Name of the gripper if there is only one."""
 _FARTHEST = 1e6
-"""[m, s] Of a point, and of a time."""
+"""Largest accepted coordinate of a point [m] and largest time [s]."""
 _MOST_PIXELS = 2**26
 _MOST_SIZES, _SMALLEST = 10.0, 0.5
-"""How far a gripper may be from the middle of the clouds, in their size, which counts as this much at least [m]."""
+"""Largest distance of a gripper from the centre of the clouds, as a multiple of their size. Sizes below `_SMALLEST` [m]
+are replaced by it."""
 _LATEST = 1e3
-"""[s] Of the offset of a clock, and of its deviation."""
+"""Largest clock offset and largest standard deviation of it [s]."""
 _FASTEST = 100.0
-"""[m/s] Of a gripper; far more than an arm reaches, also where the scene's unit is a decimetre."""
+"""Highest gripper speed [m/s]. It is far above any arm's speed, for scenes whose unit is a decimetre."""
 
 
 @dataclass(frozen=True)
 class Pinhole:
-    """A camera without distortion, pixel centres at whole numbers."""
+    """A pinhole camera without lens distortion. Pixel centres have whole coordinates."""
 
     width: int
     height: int
     focal: tuple[float, float]
     """(fx, fy) in pixels."""
     centre: tuple[float, float]
-    """(cx, cy)"""
+    """(cx, cy) in pixels."""
     T_camera_scene: NDArray[np.float64]
-    """[3, 4] maps points of the scene to the camera's frame: x right, y down, z forward; in the scene's length unit."""
+    """[3, 4] scene-to-camera transform, in the scene's length unit. Camera axes: x right, y down, z forward."""
 
     @staticmethod
     def of(told: Mapping[str, Any]) -> Pinhole:
-        """The inverse of `described`.
+        """Build the camera from a mapping as `described` returns it.
 
         Raises:
-            KeyError, TypeError, ValueError: no such camera.
+            KeyError, TypeError, ValueError: the mapping does not describe a camera.
         """
         width, height = (int(side) for side in told["size"])
         (fx, fy), (cx, cy) = (tuple(map(float, told[name])) for name in ("focal", "centre"))
@@ -67,22 +68,22 @@ class Pinhole:
 
     @property
     def position(self) -> NDArray[np.float64]:
-        """[3] where the camera stands in the scene."""
+        """[3] position of the camera in the scene."""
         return np.asarray(-self.T_camera_scene[:, :3].T @ self.T_camera_scene[:, 3])
 
     def described(self) -> dict[str, Any]:
-        """As an episode's meta has it."""
+        """Return the camera as a JSON-compatible mapping, the form in an episode's `meta`."""
         pose = self.T_camera_scene.tolist()
         return {"size": [self.width, self.height], "focal": self.focal, "centre": self.centre, "T_camera_scene": pose}
 
 
 @dataclass(frozen=True)
 class Clock:
-    """How late a camera stamps what it sees: a point stamped t shows the motion at t + offset."""
+    """Clock offset of a camera: a point stamped t belongs to the motion at t + `offset_s`."""
 
     offset_s: float
     sigma_s: float
-    """Standard deviation of it; zero of the camera to whose clock the offsets of the others refer."""
+    """Standard deviation of the offset. It is zero for the camera whose clock is the reference."""
 
 
 @dataclass(frozen=True)
@@ -90,30 +91,30 @@ class Episode:
     """A recorded episode.
 
     Raises:
-        EpisodeError: a wrong shape, an empty frame, NaN/Inf points, or times that do not increase.
+        EpisodeError: a wrong shape, an empty frame, points that are not finite, or times that do not increase.
     """
 
     points: NDArray[np.float32]
-    """[P, 3] of all frames joined."""
+    """[P, 3] points of all frames, concatenated."""
     offsets: NDArray[np.int64]
-    """[T + 1] frame t holds points[offsets[t]:offsets[t + 1]]."""
+    """[T + 1] frame t is points[offsets[t]:offsets[t + 1]]."""
     times: NDArray[np.float64]
     """[T] since the start of the motion [s]."""
     gripper: NDArray[np.float64] | None = None
-    """[T, G, 3] position of each gripper's tool; None: the scene's own motion drives the handles."""
+    """[T, G, 3] positions of the grippers. If None, the scene defines the gripper motion."""
     grippers: tuple[str, ...] = ONLY_GRIPPER
-    """[G] their names, as scenarios know them."""
+    """[G] gripper names, as in the scene."""
     camera: NDArray[np.uint8] | None = None
-    """[P] which camera saw the point."""
+    """[P] index of the camera that saw the point."""
     pixel: NDArray[np.uint16] | None = None
-    """[P, 2] (column, row)."""
+    """[P, 2] image position (column, row) of the point."""
     sigma: NDArray[np.float32] | None = None
     """[P] standard deviation of the depth [m]."""
     lost: NDArray[np.uint8] | None = None
-    """[T, C, bytes] for each of the C `pinholes`, the pixels in which it could not show the cloth: without depth, on the
-    robot or in its shadow, at a border. Rows one after the other, a bit for each pixel."""
+    """[T, C, bytes] invalid-pixel mask of each of the C `pinholes`, one bit per pixel, row by row. A set bit marks a
+    pixel in which the cloth cannot be seen: no depth, robot, robot shadow or image border."""
     meta: Mapping[str, Any] = field(default_factory=dict)
-    """scenario, fabric, category, repeat, truth, published predictions, quality figures."""
+    """Labels (scenario, fabric, category, repeat), camera data, true parameters and quality figures."""
 
     def __post_init__(self) -> None:
         points, offsets, times = self.points, self.offsets, self.times
@@ -164,9 +165,10 @@ class Episode:
             self._refuse_implausible_track(self.gripper)
 
     def _refuse_implausible_track(self, gripper: NDArray[np.float64]) -> None:
-        """
+        """Check that each gripper stays near the clouds and has a plausible speed. Others would take hours to simulate.
+
         Raises:
-            EpisodeError: a gripper that holds no cloth of these clouds: a simulation would follow it for hours.
+            EpisodeError: a gripper is too far away or too fast.
         """
         low, high = self.points.min(axis=0).astype(np.float64), self.points.max(axis=0).astype(np.float64)
         size = max(float(np.linalg.norm(high - low)), _SMALLEST)
@@ -193,10 +195,10 @@ class Episode:
 
     @property
     def viewpoints(self) -> dict[str, NDArray[np.float64]]:
-        """Camera -> [3] where it stood; empty where that is not known.
+        """Camera name -> position [3] in the scene. Empty if unknown.
 
         Raises:
-            EpisodeError: `viewpoints` of the meta are no finite positions.
+            EpisodeError: `viewpoints` of the meta is not a mapping to finite positions.
         """
         told = self.meta.get("viewpoints") or {}
         try:
@@ -209,11 +211,12 @@ class Episode:
 
     @property
     def cut_planes(self) -> dict[str, NDArray[np.float64]]:
-        """Camera -> [4] (a, b, c, d): the camera shows only points of the scene with a x + b y + c z >= d. Cameras whose
-        points were not cut have none.
+        """Camera name -> plane [4] (a, b, c, d): the camera's points were cropped to a x + b y + c z >= d.
+
+        Cameras whose points were not cropped are absent.
 
         Raises:
-            EpisodeError: `cut_planes` of the meta are no planes of its `cameras`.
+            EpisodeError: `cut_planes` of the meta are invalid, or name a camera that is not in `cameras`.
         """
         told, cameras = self.meta.get("cut_planes"), self.meta.get("cameras")
         if not told:
@@ -233,15 +236,15 @@ class Episode:
 
     @property
     def lag_sigma_s(self) -> float | None:
-        """Standard deviation with which preprocessing has measured how late the joint log is; None where it has not.
+        """Standard deviation [s] of the clock offset that preprocessing estimated, or None if it did not estimate one.
 
         Raises:
-            EpisodeError: the meta's is no positive number.
+            EpisodeError: the meta's value is not a positive number.
         """
         quality = self.meta.get("quality") or {}
         refinement = quality.get("refinement") or {} if isinstance(quality, Mapping) else {}
         told = refinement.get("lag_sigma_s") if isinstance(refinement, Mapping) else None
-        if told in (None, 0):  # no arm showed it
+        if told in (None, 0):  # the arm was not visible
             return None
         if isinstance(told, bool) or not isinstance(told, int | float) or not 0 < told < _FARTHEST:
             raise EpisodeError(f"lag_sigma_s of an episode's refinement is a positive number of seconds, got {told!r}.")
@@ -249,11 +252,12 @@ class Episode:
 
     @property
     def clocks(self) -> dict[str, Clock]:
-        """Camera -> its clock, in the order in which `camera` numbers them; empty where the meta states none. Cameras that
-        its `clocks` leave out have no offset.
+        """Camera name -> clock, in the order of the indices in `camera`. Empty if the meta has no `clocks`.
+
+        Cameras without an entry have offset 0.
 
         Raises:
-            EpisodeError: the meta's `clocks` are no offsets of its `cameras`, or points do not name their camera.
+            EpisodeError: `clocks` of the meta are invalid, or points have no valid camera index.
         """
         told = self.meta.get("clocks")
         if not told:
@@ -279,7 +283,7 @@ class Episode:
 
     @property
     def scale_sigma(self) -> float | None:
-        """By what fraction distances in the clouds may be off, one standard deviation; None where the meta does not say.
+        """Standard deviation of the clouds' length scale, as a fraction, or None if the meta does not have it.
 
         Raises:
             EpisodeError: the meta's value is not between 0 and 1.
@@ -293,10 +297,10 @@ class Episode:
 
     @property
     def pose_sigmas(self) -> dict[str, float]:
-        """Standard deviations of variables of the pose that the recording knows better or worse than usual [m, rad, s].
+        """Pose variable -> prior standard deviation [m, rad, s], for variables with another than the default value.
 
         Raises:
-            EpisodeError: the meta's `pose_sigmas` are no positive numbers.
+            EpisodeError: the meta's `pose_sigmas` are not positive numbers.
         """
         told = self.meta.get("pose_sigmas") or {}
         values = list(told.values()) if isinstance(told, Mapping) else [None]
@@ -309,10 +313,10 @@ class Episode:
 
     @cached_property
     def pinholes(self) -> tuple[Pinhole, ...]:
-        """[C] the cameras whose lost pixels are known; empty where none is.
+        """[C] cameras that have an invalid-pixel mask in `lost`. Empty if there is none.
 
         Raises:
-            EpisodeError: `pinholes` of the meta are no cameras.
+            EpisodeError: `pinholes` of the meta are not valid cameras.
         """
         told = self.meta.get("pinholes") or {}
         try:
@@ -324,17 +328,17 @@ class Episode:
             ) from error
 
     def lost_pixels(self, camera: int) -> NDArray[np.bool_]:
-        """[T, H, W] of one of the `pinholes`."""
+        """Return the invalid-pixel mask [T, H, W] of the camera with this index in `pinholes`."""
         assert self.lost is not None
         pinhole = self.pinholes[camera]
         bits = np.unpackbits(self.lost[:, camera], axis=-1, count=pinhole.width * pinhole.height)
         return bits.astype(bool).reshape(-1, pinhole.height, pinhole.width)
 
     def frame(self, index: int) -> NDArray[np.float32]:
-        """[N, 3] points of one frame; negative indices count from the end.
+        """Return the points [N, 3] of one frame. Negative indices count from the end.
 
         Raises:
-            EpisodeError: no such frame.
+            EpisodeError: the frame does not exist.
         """
         position = index + self.frame_count if index < 0 else index
         if not 0 <= position < self.frame_count:
@@ -345,10 +349,10 @@ class Episode:
         return self.points[self.offsets[position] : self.offsets[position + 1]]
 
     def select(self, kept: NDArray[np.bool_] | NDArray[np.int64]) -> Episode:
-        """The points to keep: a mask [P], or indices that go up.
+        """Return the episode with a subset of its points, given as a mask [P] or as ascending indices.
 
         Raises:
-            EpisodeError: a frame of which nothing is kept.
+            EpisodeError: a frame would have no points.
         """
         chosen = np.flatnonzero(kept) if kept.dtype == bool else kept
         return replace(
@@ -369,7 +373,7 @@ class Episode:
         grippers: tuple[str, ...] = ONLY_GRIPPER,
         meta: Mapping[str, Any] | None = None,
     ) -> Episode:
-        """Join clouds [N_t, 3]; the rest as of the fields."""
+        """Build an episode from one cloud [N_t, 3] per frame. The other arguments are the fields of the same name."""
         for index, frame in enumerate(frames):
             if frame.ndim != 2 or frame.shape[1] != 3:
                 raise EpisodeError(f"Frame {index} must have shape [points, 3], got {list(frame.shape)}.")
@@ -394,7 +398,7 @@ def _is_clock(told: object) -> bool:
 
 
 def write_episode(path: Path, episode: Episode) -> None:
-    """Write atomically; the same episode gives the same bytes."""
+    """Write an episode atomically. The same episode always gives the same bytes."""
     arrays: dict[str, Any] = {"points": episode.points, "offsets": episode.offsets, "times": episode.times}
     arrays |= {name: getattr(episode, name) for name in sorted(_OPTIONAL) if getattr(episode, name) is not None}
     arrays.pop("grippers")
@@ -405,10 +409,10 @@ def write_episode(path: Path, episode: Episode) -> None:
 
 
 def read_episode(path: Path) -> Episode:
-    """Read and check an episode. A track [T, 3], as earlier versions wrote it, is that of the only gripper.
+    """Read and check an episode. Files of earlier versions with a gripper track [T, 3] are read as having one gripper.
 
     Raises:
-        EpisodeError: missing, damaged, not an episode, or wrong inside; names the file and the field.
+        EpisodeError: the file is missing, damaged, or not a valid episode. The message names the file and the field.
     """
     path = Path(path)
     arrays = read_npz(path, kind="episode", error=EpisodeError)

@@ -1,10 +1,9 @@
-"""The one way to disk and back: outputs that belong together appear together, by one process at a time, and only data are
-read as data.
+"""Read and write files safely: atomic writes of groups of files, locks, and readers that never execute file contents.
 
-An output is written under a temporary name beside it and renamed when all outputs of its group are whole. A crash, a full
-disk or Ctrl-C leaves the former files, or none, never half of one. What a kill leaves behind has a suffix that no reader
-takes for data, and is removed by the next write of the same file. Locks are the system's (`flock`): they end with the
-process that holds them, however that ends.
+Each output is first written to a temporary file beside it. All files of a group are renamed when all are complete.
+After a crash, a full disk or Ctrl-C, the old files remain or no file exists, never a partial one. The next write of the
+same file removes temporary files that a killed process left behind. Locks use `flock`, so the system releases them when
+a process ends.
 """
 
 from __future__ import annotations
@@ -36,31 +35,31 @@ from diffcloud.io.inputs import read_text
 from diffcloud.io.numbers import CORE, WHOLE, number, whole
 
 _MOST_VALUES = 100_000
-"""Values that a YAML file may stand for."""
+"""Largest number of values in a YAML file after its anchors are expanded."""
 _MOST_JSON, _MOST_YAML = 50_000_000, 1_000_000
-"""Bytes of a file of text that is read as a whole: JSON; YAML, whose reader is slow."""
+"""Largest size of a JSON and of a YAML file [bytes]. The YAML limit is lower because the YAML reader is slow."""
 _COMMENT = re.compile(r'"(?:[^"\\]|\\.)*+"|//[^\n]*|#[^\n]*|/\*.*?\*/', re.DOTALL)
-"""A string of JSON, in which nothing is a comment, or a comment."""
+"""Matches a comment or a string of JSON. Strings are matched so that comment signs in them are skipped."""
 _SHARED_TIME = 1_600_000_000
-"""Modification time given to files that several processes write with the same text [s]."""
+"""Modification time [s since 1970] of files that several processes write with the same text."""
 TEMPORARY, LOCK = ".diffcloud-tmp", ".diffcloud-lock"
-"""Suffixes of a file that is being written, and of the lock file beside an output that a command holds."""
+"""Suffixes of a temporary file, and of the lock file beside an output."""
 _NO_LOCKS = {errno.ENOLCK, errno.ENOTSUP, errno.EINVAL}
-"""What a file system without locks answers; nothing is locked there."""
+"""Error numbers of file systems without locks. On these, outputs are not locked."""
 
 
 class _Outputs:
-    """Files that take their names together."""
+    """A group of output files that are renamed together."""
 
     def __init__(self) -> None:
         self._pending: dict[Path, tuple[Path, int]] = {}
-        """Output -> its temporary file and that file's inode."""
+        """Output -> its temporary file and the inode of this file."""
         self._folders: list[Path] = []
-        """Made for the outputs, outermost first."""
+        """Folders created for the outputs, outermost first."""
 
     @contextmanager
     def open(self, path: Path) -> Iterator[BinaryIO]:
-        """A stream to the temporary file of `path`."""
+        """Open the temporary file of `path` for writing."""
         self._folders += _make_folders(path.parent)
         if path.is_dir():
             raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
@@ -71,7 +70,7 @@ class _Outputs:
             yield stream
 
     def publish(self) -> None:
-        """Give all files their names."""
+        """Rename all temporary files to their final names."""
         for path, (temporary, inode) in self._pending.items():
             if _inode(temporary) != inode:
                 raise OutputError(f"Another process wrote {path} at the same time; run the command again.")
@@ -82,7 +81,7 @@ class _Outputs:
         self._pending.clear()
 
     def discard(self) -> None:
-        """Remove what has not been published."""
+        """Remove temporary files that were not renamed, and empty folders that were created for them."""
         for temporary, inode in self._pending.values():
             with suppress(OSError):
                 if _inode(temporary) == inode:
@@ -92,18 +91,18 @@ class _Outputs:
 
 
 _group: ContextVar[_Outputs | None] = ContextVar("_group", default=None)
-"""Of the innermost `together`."""
+"""Outputs of the current `together` block, if any."""
 
 
 @contextmanager
 def together() -> Iterator[None]:
-    """What is written in this block is all there after it, or, if it ends with an error, all as it was before.
+    """Publish all files written in this block together, or none of them if the block raises an error.
 
-    The file written last is the record: while it is there, the others are whole. So it is the first to go where the group
-    replaces a former one, and the last to come. A block inside another belongs to the outer one.
+    Write the record last: if it exists, all other files are complete. For this reason, publishing removes the old
+    record first and adds the new one last. A nested block belongs to the outer block.
 
     Raises:
-        OutputError: the system refused to put the files in place; the message names one.
+        OutputError: the system refused to rename a file; the message names the file.
     """
     if _group.get() is not None:
         yield
@@ -123,12 +122,12 @@ def together() -> Iterator[None]:
 
 @contextmanager
 def atomic(path: Path) -> Iterator[BinaryIO]:
-    """A stream that becomes `path` when the block, and a `together` around it, ends without an error.
+    """Open a stream whose contents become `path` when the block and an enclosing `together` end without an error.
 
-    A library that wants a path may write to the stream's `name`.
+    For a library that needs a path instead of a stream, use the stream's `name`.
 
     Raises:
-        OutputError: the system refused the write, or another process is writing the same file; names the file.
+        OutputError: the system refused the write, or another process is writing the same file.
     """
     path = Path(path)
     with together():
@@ -143,12 +142,12 @@ def atomic(path: Path) -> Iterator[BinaryIO]:
 
 @contextmanager
 def staged(folder: Path) -> Iterator[Path]:
-    """A temporary folder, not yet there, that becomes `folder`, which must not exist, if the block ends without an error.
+    """Yield the path of a new temporary folder, which is renamed to `folder` if the block ends without an error.
 
-    What a kill leaves of it is removed by the next call for the same folder.
+    `folder` must not exist. The next call for the same folder removes what a killed process left behind.
 
     Raises:
-        OutputError: the system refused to put it in place.
+        OutputError: the system refused to rename the folder.
     """
     folder = Path(folder)
     temporary = folder.with_name(f".{folder.name}{TEMPORARY}")
@@ -174,12 +173,12 @@ def write_text(path: Path, text: str) -> None:
 
 
 def write_shared(path: Path, text: str) -> None:
-    """Write a text file that other processes may be writing at this moment with the same text.
+    """Write a text file that other processes may be writing at the same time with the same text.
 
-    Whoever comes last, the file is the same, and so is its time of change, which caches compare.
+    The result, including its modification time (which caches compare), does not depend on which process is last.
 
     Raises:
-        OutputError: the system refused the write; names the file.
+        OutputError: the system refused the write.
     """
     path = Path(path)
     temporary = path.with_name(f".{path.name}.{os.getpid()}{TEMPORARY}")
@@ -195,12 +194,12 @@ def write_shared(path: Path, text: str) -> None:
 
 
 def write_json(path: Path, value: Any) -> None:
-    """Write JSON atomically; NaN and infinity are refused, since no other reader takes them."""
+    """Write JSON atomically. NaN and infinity raise ValueError, because JSON does not have them."""
     write_text(path, json.dumps(value, indent=2, allow_nan=False) + "\n")
 
 
 def write_npz(path: Path, *, compressed: bool = True, **arrays: Any) -> None:
-    """Write an NPZ file atomically, without pickles; the same arrays give the same bytes."""
+    """Write an NPZ file atomically and without pickles. The same arrays always give the same bytes."""
     save = np.savez_compressed if compressed else np.savez
     with atomic(path) as stream:
         save(stream, allow_pickle=False, **arrays)
@@ -210,11 +209,10 @@ def read_json(path: Path, *, error: type[DiffCloudError] = DiffCloudError, comme
     """Read a JSON file.
 
     Args:
-        comments: accept comments (`//`, `/* */` and `#`), as the reader of ARCSim does.
+        comments: accept comments (`//`, `/* */` and `#`), as ARCSim does.
 
     Raises:
-        error: the file is missing, no regular file or not JSON, too large, or names a field twice; the message names the
-            file and the place.
+        error: the file is missing, not a regular file, too large, not JSON, or has a duplicate key.
     """
     try:
         text = read_text(path, error=error, most_bytes=_MOST_JSON)
@@ -224,20 +222,22 @@ def read_json(path: Path, *, error: type[DiffCloudError] = DiffCloudError, comme
             parse_constant=_refuse_constant,
             parse_float=_finite,
         )
-    except (ValueError, RecursionError) as damage:  # of JSON and numbers
+    except (ValueError, RecursionError) as damage:  # ValueError: a syntax error, NaN, or an infinite number
         raise error(f"{path} is not readable JSON: {damage}.") from damage
 
 
 def read_yaml(path: Path, *, error: type[DiffCloudError] = DiffCloudError, kind: str = "file") -> Any:
-    """Read a YAML file of plain values. Booleans and numbers are those of YAML 1.2; `yes`, `1:30`, `0x10`, `010` and
-    `1_000` are texts.
+    """Read a YAML file of plain values.
+
+    Booleans and numbers follow YAML 1.2, and only decimal numbers are read as numbers. `yes`, `1:30`, `0x10`, `010` and
+    `1_000` are strings.
 
     Args:
-        kind: what it is, for the message if it is missing.
+        kind: kind of file, for the message if it is missing.
 
     Raises:
-        error: the file is missing, no regular file, is not YAML, too large, names a field twice, or its anchors stand for
-            too much; the message names file and place.
+        error: the file is missing, not a regular file, too large, not YAML, has a duplicate key, or its anchors expand
+            to too many values. The message names the file and the position.
     """
     try:
         loader = _PlainLoader(read_text(path, kind=kind, error=error, most_bytes=_MOST_YAML))
@@ -254,11 +254,11 @@ def read_yaml(path: Path, *, error: type[DiffCloudError] = DiffCloudError, kind:
 
 
 class _PlainLoader(yaml.SafeLoader):
-    """Plain values as in YAML 1.2. PyYAML's own are of YAML 1.1, where `1:30` is 90, `010` is 8 and `no` is false."""
+    """YAML loader with the plain values of YAML 1.2. In PyYAML's 1.1, `1:30` is 90, `010` is 8, `no` is false."""
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
         self.flatten_mapping(node)
-        for key, _ in node.value:  # names are texts, also of a recording that is called 1e5
+        for key, _ in node.value:  # keys are strings, also a recording name such as 1e5
             if isinstance(key, yaml.ScalarNode):
                 key.tag = "tag:yaml.org,2002:str"
         return super().construct_mapping(node, deep=deep)
@@ -270,7 +270,7 @@ class _PlainLoader(yaml.SafeLoader):
         return whole(node.value)
 
 
-_PlainLoader.yaml_implicit_resolvers = {}  # its own, without those of YAML 1.1
+_PlainLoader.yaml_implicit_resolvers = {}  # drop the resolvers of YAML 1.1
 _PlainLoader.add_constructor("tag:yaml.org,2002:float", _PlainLoader.construct_plain_float)
 _PlainLoader.add_constructor("tag:yaml.org,2002:int", _PlainLoader.construct_plain_int)
 for _tag, _plain, _first in (
@@ -287,7 +287,7 @@ for _tag, _plain, _first in (
 
 
 def _blank(match: re.Match[str]) -> str:
-    """A comment as white space on as many lines, so that errors name the right place; a string as it is."""
+    """Replace a comment by spaces and keep its line breaks, so that errors have the right position. Keep strings."""
     held = match.group()
     return held if held.startswith('"') else re.sub(r"[^\n]", " ", held)
 
@@ -304,7 +304,7 @@ def _finite(text: str) -> float:
 
 
 def _object(path: Path, error: type[DiffCloudError], pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    """A JSON object whose names are all different."""
+    """Return the pairs of a JSON object as a dictionary, or raise `error` for a duplicate key."""
     found = dict(pairs)
     if len(found) < len(pairs):
         twice = Counter(name for name, _ in pairs).most_common(1)[0][0]
@@ -313,9 +313,10 @@ def _object(path: Path, error: type[DiffCloudError], pairs: list[tuple[str, Any]
 
 
 def _refuse_twice(node: yaml.Node | None, path: Path, error: type[DiffCloudError]) -> None:
-    """
+    """Check that no mapping of a YAML document has a duplicate key; one of the values would be lost.
+
     Raises:
-        error: a mapping names a key twice, of which one would be lost.
+        error: a key occurs twice.
     """
     seen: set[int] = set()
     open_nodes = [] if node is None else [node]
@@ -338,18 +339,19 @@ def _refuse_twice(node: yaml.Node | None, path: Path, error: type[DiffCloudError
 
 
 def _yaml_size(node: yaml.Node | None, known: dict[int, int]) -> int:
-    """How many values a node stands for, its aliases written out."""
+    """Return the number of values of a node after its aliases are expanded."""
     if isinstance(node, yaml.CollectionNode) and id(node) not in known:
-        known[id(node)] = 1  # of an alias to what surrounds it
+        known[id(node)] = 1  # for aliases to a node that contains them
         parts = [part for pair in node.value for part in (pair if isinstance(pair, tuple) else (pair,))]
         known[id(node)] = 1 + sum(_yaml_size(part, known) for part in parts)
     return known.get(id(node), 1)
 
 
 def refuse_undecoded(names: Iterable[str | Path]) -> None:
-    """
+    """Check that file names are valid in the system's encoding; otherwise records and reports cannot contain them.
+
     Raises:
-        DiffCloudError: the name of a file is not in the system's encoding; records and reports could not hold it.
+        DiffCloudError: a name has undecodable bytes.
     """
     for name in map(str, names):
         if any("\ud800" <= letter <= "\udfff" for letter in name):
@@ -361,12 +363,15 @@ def refuse_undecoded(names: Iterable[str | Path]) -> None:
 
 
 def files_in(folder: Path, *suffixes: str) -> list[Path]:
-    """Data files of a folder by name, with one of these suffixes (lower case; none given: any).
+    """List the data files of a folder, sorted by name.
 
-    Hidden files are never data: editors, operating systems and interrupted writes leave such behind (`._a.npz`).
+    Hidden files are skipped: editors, operating systems and interrupted writes leave them behind (`._a.npz`).
+
+    Args:
+        suffixes: accepted suffixes in lower case; all files if none is given.
 
     Raises:
-        DiffCloudError: a name is not in the system's encoding.
+        DiffCloudError: a name is not valid in the system's encoding.
     """
     if not Path(folder).is_dir():
         return []
@@ -380,7 +385,7 @@ def files_in(folder: Path, *suffixes: str) -> list[Path]:
 
 
 def folders_in(folder: Path) -> list[Path]:
-    """Folders of a folder by name, without hidden ones."""
+    """List the folders in a folder, sorted by name, without hidden ones."""
     if not Path(folder).is_dir():
         return []
     found = sorted(path for path in Path(folder).iterdir() if not path.name.startswith(".") and path.is_dir())
@@ -390,10 +395,10 @@ def folders_in(folder: Path) -> list[Path]:
 
 @contextmanager
 def claimed(output: Path) -> Iterator[None]:
-    """Hold an output, file or folder, against other processes; by a lock file beside it that is there only meanwhile.
+    """Lock an output (file or folder) against other processes during the block, with a lock file beside it.
 
     Raises:
-        OutputError: another process holds it (names that process), or the place cannot be written.
+        OutputError: another process has locked it (the message names the process), or the location is not writable.
     """
     output = Path(os.path.realpath(output))
     lock = output.with_name(f".{output.name}{LOCK}")
@@ -415,14 +420,14 @@ def claimed(output: Path) -> Iterator[None]:
 
 
 def _hold(lock: Path, output: Path) -> int:
-    """A descriptor of the lock file, locked until it is closed."""
+    """Lock the lock file and return its descriptor. Closing the descriptor releases the lock."""
     while True:
         descriptor = os.open(lock, os.O_CREAT | os.O_RDWR, 0o666)
         if not _try_lock(descriptor):
             holder = _holder(descriptor)
             os.close(descriptor)
             raise OutputError(f"{output} is being written by {holder}. Wait for it, stop it, or choose another output.")
-        # the former holder removes the file before it lets go: a lock on a removed file holds nobody off
+        # The previous owner removes the file before it releases the lock. A lock on a removed file has no effect.
         if os.fstat(descriptor).st_ino == _inode(lock):
             return descriptor
         os.close(descriptor)
@@ -438,7 +443,7 @@ def _holder(descriptor: int) -> str:
     try:
         told = json.loads(os.pread(descriptor, 65536, 0))
         return f"process {told['process']} on {told['host']} since {told['since']} ({told['command']})"
-    except (OSError, ValueError, KeyError, TypeError):  # it is only just about to tell
+    except (OSError, ValueError, KeyError, TypeError):  # the other process has not written its description yet
         return "another process"
 
 
@@ -456,10 +461,10 @@ def _try_lock(descriptor: int) -> bool:
 
 @contextmanager
 def _opened_alone(path: Path, temporary: Path) -> Iterator[BinaryIO]:
-    """The temporary file, new and locked; one that an ended process left is removed.
+    """Create and lock a temporary file. A file that an ended process left behind is removed first.
 
     Raises:
-        OutputError: another process holds it.
+        OutputError: another process has locked the file.
     """
     while True:
         try:
@@ -492,7 +497,7 @@ def _inode(path: Path) -> int | None:
 
 
 def _make_folders(folder: Path) -> list[Path]:
-    """Make a folder and what it lies in; those that were missing, outermost first."""
+    """Create a folder and its parents, and return those that were missing, outermost first."""
     missing = []
     while not folder.exists():
         missing.append(folder)
@@ -504,5 +509,5 @@ def _make_folders(folder: Path) -> list[Path]:
 
 def _remove_empty(folders: list[Path]) -> None:
     for folder in reversed(folders):
-        with suppress(OSError):  # it has something in it by now
+        with suppress(OSError):  # the folder is no longer empty
             folder.rmdir()

@@ -1,4 +1,4 @@
-"""Fingerprints: whether a result kept on disk still belongs to what decides its numbers, source code included."""
+"""Fingerprints that tell whether a stored result is up to date with its settings, data and source code."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from diffcloud.io.files import read_json
 
 
 def fingerprint(plan: Any, *, packages: Sequence[str]) -> str:
-    """Hexadecimal digest that is equal where the plan, the sources and the versions of torch and numpy are.
+    """Return a hexadecimal digest of the plan, the source files, and the versions of torch and numpy.
 
     Args:
-        plan: dataclasses, mappings, sequences, arrays, numbers, strings.
-        packages: sub-packages of diffcloud whose source decides the numbers.
+        plan: settings and data: dataclasses, mappings, sequences, arrays, numbers, strings.
+        packages: sub-packages of diffcloud whose source code affects the result.
     """
     digest = hashlib.sha256()
     for package in packages:
@@ -32,17 +32,17 @@ def fingerprint(plan: Any, *, packages: Sequence[str]) -> str:
 
 
 def kept_record(path: Path, mark: str) -> dict[str, Any] | None:
-    """The JSON object that an earlier run left at `path`, if it has this fingerprint; None if there is none.
+    """Return the JSON object at `path` if it has this fingerprint, otherwise None.
 
     Raises:
-        DiffCloudError: a file that is no JSON.
+        DiffCloudError: the file is not valid JSON.
     """
     kept = read_json(path) if path.is_file() else None
     return kept if isinstance(kept, dict) and kept.get("fingerprint") == mark else None
 
 
 def _described(value: Any) -> Any:
-    """Plain JSON that is equal where the values are."""
+    """Convert a value to plain JSON that is equal exactly for equal values."""
     if isinstance(value, np.ndarray):
         return [str(value.dtype), value.shape, hashlib.sha256(np.ascontiguousarray(value).tobytes()).hexdigest()]
     if is_dataclass(value) and not isinstance(value, type):

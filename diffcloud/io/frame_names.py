@@ -1,12 +1,10 @@
-"""Frames that lie in files named by number: by frame number, or by time.
+"""Order files of frames by the number in their names, which is a frame number or a time.
 
-The last number of a name counts: `frame_000123_1.5.ply` is 1.5. What the numbers of a folder mean is decided for all of
-them together:
+The last number of a name is used: `frame_000123_1.5.ply` gives 1.5. All names in a folder are interpreted alike:
 
-- With a decimal point in any name, or a date and a time of day: times, in seconds.
-- Whole or decimal numbers of the size of a time since 1970 (years 1990 to 2100): times, in seconds, milliseconds,
-  microseconds or nanoseconds, whichever unit gives such a year.
-- Other whole numbers: frame numbers.
+- Times in seconds, if any name has a decimal point, or a date with time of day.
+- Times since 1970, if all numbers give years 1990 to 2100 in seconds, milliseconds, microseconds or nanoseconds.
+- Frame numbers, if the numbers are other whole numbers.
 """
 
 from __future__ import annotations
@@ -25,20 +23,20 @@ from diffcloud.errors import EpisodeError
 from diffcloud.io.files import files_in
 
 _NUMBER = re.compile(r"(?:(?<![^\W_])-)?\d+(?:\.\d+)?(?:[eE][+-]\d+)?")
-"""A hyphen is a minus only where no letter or digit stands before it: frame-0001 is frame 1."""
+"""A hyphen is a minus sign only if no letter or digit precedes it: frame-0001 is frame 1."""
 _DATE_TIME = re.compile(
     r"(?<!\d)((?:19|20)\d\d)-?(\d\d)-?(\d\d)[T_ -](\d\d)[-:_](\d\d)[-:_](\d\d)(?:[.,_](\d{1,9})(?!\d))?"
 )
 _SECONDS_NANOSECONDS = re.compile(r"(?<!\d)(\d{9,10})[_-](\d{9})$")
-"""ROS tools write the two parts of a stamp so."""
+"""Matches a ROS time stamp written as seconds and nanoseconds."""
 _EPOCH_S = (631_152_000, 4_102_444_800)
-"""1990 to 2100 [s since 1970]."""
+"""Years 1990 to 2100 [s since 1970]."""
 _UNITS = {"seconds": 0, "milliseconds": 3, "microseconds": 6, "nanoseconds": 9}
 _MOST_FRAMES = 100_000_000
 _LEAST_HZ, _MOST_HZ = 0.01, 1000.0
-"""Frame rates from a slow time-lapse to a fast simulation. Others mean that the numbers are no times in seconds."""
+"""Plausible frame rates, from time-lapse to fast simulation. Other numbers cannot be times in seconds."""
 _SAME_RATE = 0.05
-"""Part by which a stated rate may differ from that of the times in names, which may be rounded."""
+"""Tolerance between a stated frame rate and the rate of times in names, which may be rounded (fraction)."""
 
 
 @dataclass(frozen=True)
@@ -47,21 +45,22 @@ class NamedFrames:
 
     paths: tuple[Path, ...]
     numbers: tuple[int, ...]
-    """[N] Of the frames; 0, 1, ... where the names are times."""
+    """[N] frame numbers, or 0, 1, ... if names are times."""
     times: NDArray[np.float64] | None
-    """[N] Times that the names state [s], since 1970 or since any other moment; None where names are frame numbers."""
+    """[N] times in the names [s] from an arbitrary start. None if names are frame numbers."""
 
     @property
     def rate_hz(self) -> float | None:
-        """Of the names' times (median); None without them, and of a single frame."""
+        """Median frame rate of the times in names. None without times, or for a single frame."""
         if self.times is None or len(self.times) < 2:
             return None
         return float(1 / np.median(np.diff(self.times)))
 
     def check_rate(self, rate_hz: float | None, folder: Path) -> None:
-        """
+        """Compare a stated frame rate [Hz] with the times in the names.
+
         Raises:
-            EpisodeError: a stated frame rate [Hz] contradicts the times in the names.
+            EpisodeError: they contradict each other.
         """
         own = self.rate_hz
         if rate_hz is not None and own is not None and not abs(own / rate_hz - 1) < _SAME_RATE:
@@ -73,16 +72,16 @@ class NamedFrames:
 
 
 def named_frames(folder: Path, formats: tuple[str, ...], *, kind: str, gaps: bool = False) -> NamedFrames:
-    """Data files of a folder in the order of the numbers in their names. Files without a number are left out.
+    """List the files of a folder in the order of the numbers in their names. Files without a number are skipped.
 
     Args:
-        formats: suffixes, in lower case.
-        kind: of file, for messages, such as "clouds".
-        gaps: whether frame numbers may be missing.
+        formats: suffixes in lower case.
+        kind: kind of files, for messages, such as "clouds".
+        gaps: allow missing frame numbers.
 
     Raises:
-        EpisodeError: no such folder or file, two files of one number, frame numbers that are missing, or numbers that are
-            neither frames nor plausible times.
+        EpisodeError: the folder or files are missing, two files have one number, frame numbers are missing, or numbers
+            are neither frame numbers nor plausible times.
     """
     folder = Path(folder)
     if not folder.is_dir():
@@ -122,14 +121,14 @@ def named_frames(folder: Path, formats: tuple[str, ...], *, kind: str, gaps: boo
 
 
 def _number(stem: str) -> tuple[Decimal | None, bool]:
-    """(number of a name, None without one; whether its form says that it is a time [s])."""
+    """Return the number in a file name (or None), and whether its form shows that it is a time [s]."""
     match = _DATE_TIME.search(stem)
     if match is not None:
         *parts, fraction = match.groups()
         try:
             whole = int(datetime(*map(int, parts), tzinfo=UTC).timestamp())  # type: ignore[arg-type, misc]
         except ValueError:
-            pass  # no date
+            pass  # not a valid date
         else:
             return whole + Decimal(f"0.{fraction or 0}"), True
     match = _SECONDS_NANOSECONDS.search(stem)
@@ -146,7 +145,7 @@ def _is_since_1970(values: list[Decimal], digits: int) -> bool:
 
 def _refuse_gaps(numbers: tuple[int, ...], folder: Path) -> None:
     gaps = [(before, after) for before, after in pairwise(numbers) if after > before + 1]
-    if gaps:  # not each number in them
+    if gaps:  # list only the first missing numbers, since a gap may be huge
         missing = [number for before, after in gaps[:10] for number in range(before + 1, min(after, before + 11))][:10]
         raise EpisodeError(
             f"{folder}: frames {missing} are missing between {numbers[0]} and {numbers[-1]}; renumber or record again. If "

@@ -1,4 +1,4 @@
-"""Tracks of grippers from CSV files: one file for all of them, or one each."""
+"""Read gripper tracks from CSV files: one file for all grippers, or one file each."""
 
 from __future__ import annotations
 
@@ -22,28 +22,28 @@ _BEYOND_S = 0.2
 
 @dataclass(frozen=True)
 class GripperTracks:
-    """Where each of G grippers was in each of T frames."""
+    """Positions of G grippers in T frames."""
 
     names: tuple[str, ...]
     """[G]"""
     positions: NDArray[np.float64]
     """[T, G, 3] [m]"""
     times: NDArray[np.float64] | None
-    """[T] since the first [s]; None where the files have no t_s."""
+    """[T] since the first frame [s]. None if the files have no column t_s."""
 
 
 def read_tracks(files: Mapping[str, Path], frames: int, stamps: NDArray[np.float64] | None = None) -> GripperTracks:
-    """The tracks of one or several grippers.
+    """Read the tracks of one or several grippers.
 
     Args:
-        files: name -> CSV with columns x, y, z [m] and optionally t_s [s], one row a frame. With t_s and `stamps`, rows may
-            have another rate; then positions are interpolated. A single file may hold several grippers: with a column
-            `gripper` that names them. These names replace its own.
-        frames: T.
+        files: gripper name -> CSV file with columns x, y, z [m] and optionally t_s [s]. It has one row per frame, or, with
+            t_s and `stamps`, rows at any rate, which are interpolated. A single file may hold several grippers: it has a
+            column `gripper`, and one row per frame and gripper.
+        frames: number of frames T.
         stamps: [T] times of the clouds, on the clock of t_s [s].
 
     Raises:
-        EpisodeError: an unreadable file, missing columns or rows, positions in other units, or times that differ.
+        EpisodeError: a file is not readable, columns or rows are missing, positions are not in metres, or times differ.
     """
     tables = {
         name: read_csv(path, kind="gripper file", error=EpisodeError, text=("gripper",)) for name, path in files.items()
@@ -101,10 +101,10 @@ def _interpolated(
 
 
 def named_files(given: list[str]) -> dict[str, Path]:
-    """NAME=PATH, or PATH alone of a single file.
+    """Parse NAME=PATH arguments, or a single PATH, into gripper name -> file.
 
     Raises:
-        EpisodeError: several without names, or one name twice.
+        EpisodeError: a name is missing or occurs twice.
     """
     if len(given) == 1 and "=" not in given[0]:
         return {ONLY_GRIPPER[0]: Path(given[0])}

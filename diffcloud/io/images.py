@@ -1,7 +1,7 @@
-"""PNG images that are what they say: 16-bit depth and 8-bit colour, whole or refused.
+"""Read and write PNG images: 16-bit depth and 8-bit colour. Damaged or incomplete images are refused.
 
-Depth is lossless by contract. JPEG smears depth over object borders (and the reference recordings were stored so), hence
-it is recognised by its first bytes, whatever its name says.
+Depth must be lossless. JPEG blurs depth across object borders (the reference recordings were stored as JPEG), so JPEG
+depth is refused. The format is recognised by the first bytes, not by the file name.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ _PNG = b"\x89PNG\r\n\x1a\n"
 _JPEG = b"\xff\xd8\xff"
 _LARGEST_PIXELS = 8192 * 8192
 _LARGEST_BYTES = 512 << 20
-"""Of a file: the largest colour image, without compression, has 200 MB, with 16 bits twice as many."""
+"""Largest file [bytes]. An uncompressed colour image of the largest size has 200 MB, or 400 MB with 16 bits."""
 
 
 def write_depth(path: Path, depth: NDArray[np.uint16], *, durable: bool = False) -> None:
-    """Write depth [H, W] as a 16-bit PNG, atomically. `durable`: also through a power cut.
+    """Write depth [H, W] as a 16-bit PNG, atomically. `durable` flushes the file to disk, to survive a power cut.
 
     Raises:
-        EpisodeError: not uint16 [H, W].
+        EpisodeError: the array is not uint16 [H, W].
         OutputError: the system refused the write (a full disk).
     """
     if depth.dtype != np.uint16 or depth.ndim != 2:
@@ -42,7 +42,7 @@ def write_color(path: Path, color: NDArray[np.uint8], *, durable: bool = False) 
     """Write colour [H, W, 3] (red, green, blue) as an 8-bit PNG, atomically.
 
     Raises:
-        EpisodeError: not uint8 [H, W, 3].
+        EpisodeError: the array is not uint8 [H, W, 3].
         OutputError: the system refused the write (a full disk).
     """
     if color.dtype != np.uint8 or color.ndim != 3 or color.shape[2] != 3:
@@ -51,16 +51,16 @@ def write_color(path: Path, color: NDArray[np.uint8], *, durable: bool = False) 
 
 
 def read_depth(path: Path) -> NDArray[np.uint16]:
-    """Depth [H, W] of a 16-bit PNG, in units of the camera's `depth_scale_m`.
+    """Read depth [H, W] from a 16-bit PNG, in units of the camera's `depth_scale_m`.
 
     Raises:
-        EpisodeError: missing, truncated, a JPEG, or not 16-bit grey; says which.
+        EpisodeError: the file is missing, truncated, a JPEG, or not 16-bit grey.
     """
     return decode_depth(_bytes(path), str(path))
 
 
 def decode_depth(data: bytes, name: str) -> NDArray[np.uint16]:
-    """Depth [H, W] from the bytes of a PNG; `name` is used in messages."""
+    """Decode depth [H, W] from the bytes of a PNG. `name` is used in error messages."""
     if data.startswith(_JPEG):
         raise EpisodeError(
             f"{name} is a JPEG. JPEG changes depth by centimetres at every border: record depth as 16-bit PNG, lossless."
@@ -74,19 +74,19 @@ def decode_depth(data: bytes, name: str) -> NDArray[np.uint16]:
 
 
 def read_color(path: Path) -> NDArray[np.uint8]:
-    """Colour [H, W, 3] (red, green, blue) of an 8-bit PNG.
+    """Read colour [H, W, 3] (red, green, blue) from an 8-bit PNG or a JPEG.
 
     Raises:
-        EpisodeError: missing, truncated, or not an 8-bit colour image.
+        EpisodeError: the file is missing, truncated, or not an 8-bit colour image.
     """
     return decode_color(_bytes(path), str(path))
 
 
 def decode_color(data: bytes, name: str) -> NDArray[np.uint8]:
-    """Colour [H, W, 3] from the bytes of a PNG, or of a JPEG: for colour that is harmless.
+    """Decode colour [H, W, 3] from the bytes of a PNG or a JPEG. Lossy compression does no harm to colour.
 
     Raises:
-        EpisodeError: truncated, damaged, larger than any camera's image, or not 8-bit colour.
+        EpisodeError: the image is truncated, damaged, too large for a camera image, or not 8-bit.
     """
     if data.startswith(_JPEG):
         _check_size(*_jpeg_size(data, name), name)
@@ -101,7 +101,7 @@ def decode_color(data: bytes, name: str) -> NDArray[np.uint8]:
 
 
 def png_size(path: Path) -> tuple[int, int]:
-    """(width, height) from the header alone."""
+    """Return (width, height) of a PNG file, from its header only."""
     with open_input(path, kind="image", error=EpisodeError) as stream:
         head = stream.read(24)
     if not head.startswith(_PNG) or len(head) < 24:
@@ -111,10 +111,10 @@ def png_size(path: Path) -> tuple[int, int]:
 
 
 def check_png(data: bytes, name: str) -> None:
-    """Every chunk present and its checksum right; OpenCV would fill a truncated image with zeros without a word.
+    """Check that all chunks of a PNG are present and valid. OpenCV silently fills a truncated image with zeros.
 
     Raises:
-        EpisodeError: not a PNG, truncated, damaged, or larger than any camera's image.
+        EpisodeError: the data are not a PNG, truncated, damaged, or too large for a camera image.
     """
     if not data.startswith(_PNG):
         kind = "a JPEG" if data.startswith(_JPEG) else "not a PNG"
@@ -139,21 +139,21 @@ def check_png(data: bytes, name: str) -> None:
 
 
 def _jpeg_size(data: bytes, name: str) -> tuple[int, int]:
-    """(width, height) of the frame's header (SOF), which comes after other segments; each states its length.
+    """Return (width, height) from the frame header (SOF segment) of a JPEG, skipping the segments before it.
 
     Raises:
-        EpisodeError: there is none.
+        EpisodeError: there is no frame header.
     """
     position = 2
     while position + 9 <= len(data) and data[position] == 0xFF:
         kind, length = data[position + 1], int.from_bytes(data[position + 2 : position + 4], "big")
-        if kind == 0xFF:  # a byte that fills up
+        if kind == 0xFF:  # a fill byte
             position += 1
             continue
         if 0xC0 <= kind <= 0xCF and kind not in (0xC4, 0xC8, 0xCC):
             height, width = struct.unpack(">HH", data[position + 5 : position + 9])
             return width, height
-        if kind in (0xD9, 0xDA) or length < 2:  # the end, or pixels
+        if kind in (0xD9, 0xDA) or length < 2:  # end of image, or start of the pixel data
             break
         position += 2 + length
     raise EpisodeError(f"{name} is a JPEG that states no size before its pixels: it is damaged. Drop the frame.")
@@ -165,7 +165,7 @@ def _check_size(width: int, height: int, name: str) -> None:
 
 
 def encode_jpeg(color: NDArray[np.uint8], *, width: int) -> bytes:
-    """Colour [H, W, 3] (red, green, blue) as a JPEG at most so wide, for a page to show."""
+    """Encode colour [H, W, 3] (red, green, blue) as a JPEG of at most `width` pixels, for a web page."""
     import cv2
 
     if color.shape[1] > width:
@@ -199,7 +199,7 @@ def _cv2_decode(data: bytes, name: str) -> NDArray[Any]:
 def _write(path: Path, image: NDArray[Any], durable: bool) -> None:
     import cv2
 
-    # run lengths only: half the time of zlib's fastest level, and no larger
+    # Run-length encoding takes half the time of zlib's fastest level, and the files are no larger.
     done, data = cv2.imencode(".png", image, [cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE])
     if not done:
         raise EpisodeError(f"{path}: the image could not be encoded as PNG.")

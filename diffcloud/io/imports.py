@@ -1,4 +1,4 @@
-"""Importing recordings of others as episodes: the published data, and folders of cloud files."""
+"""Import other recordings as episodes: the published data, and folders of cloud files."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ RELEASE_FOLDERS = {
     "band": ("band_sim_pcls", 0),
     "hang": ("hang_sim_pcls", 0),
 }
-"""Scenario -> folder, and the step whose state file 0 is compared with. Real recordings: file j meets the state after
-j + 1 steps, as in the published scripts. Simulated ones were written starting with the initial state, so file j is the
-state after j steps; the published scripts compare them one step off."""
+"""Motion -> (folder, number of steps before file 0). In real recordings, file j belongs to the state after j + 1 steps,
+as in the published scripts. Simulated recordings start with the initial state, so file j belongs to the state after j
+steps. The published scripts are one step off there."""
 ASSUMED_CATEGORIES = {
     "polka": "highly deformable",
     "navy": "medium",
@@ -37,22 +37,22 @@ ASSUMED_CATEGORIES = {
     "redblack": "shape retaining",
     "paper": "shape retaining",
 }
-"""The paper names the categories, not which fabric is in which: this is our reading of its text and figures."""
+"""Fabric -> category. The paper does not state this assignment; it is our interpretation of the text and figures."""
 _MODELS = ("mlp", "pointnet2", "meteornet")
 _MOST_NAMED = 5
-"""Empty frames in a message."""
+"""Largest number of empty frames that a message lists."""
 _SAME_STEP = 0.5
-"""Part of a frame interval by which a CSV's times may differ from those in the names."""
+"""Tolerance between times in a CSV and times in file names (fraction of a frame interval)."""
 
 
 def release_episodes(folder: Path) -> Iterator[tuple[str, str, Episode]]:
-    """(scenario, name, episode) of every recording in the published layout.
+    """Yield (scenario, name, episode) for each recording in the published folder layout.
 
     Args:
-        folder: holds `lift_real_pcls/` and its siblings; those that exist are read.
+        folder: folder with `lift_real_pcls/` and similar folders. Missing ones are skipped.
 
     Raises:
-        EpisodeError: none of them is there, or a file is damaged.
+        EpisodeError: none of the folders exists, or a file is damaged.
     """
     folder = Path(folder)
     found = {name: folder / sub for name, (sub, _) in RELEASE_FOLDERS.items() if (folder / sub).is_dir()}
@@ -82,17 +82,17 @@ def cloud_folder(
     rate_hz: float | None = None,
     meta: dict[str, Any] | None = None,
 ) -> Episode:
-    """An episode from a folder of numbered clouds, one file a frame.
+    """Build an episode from a folder of numbered clouds, one file per frame.
 
     Args:
-        folder: files `<anything><number>.(npy|ply|xyz|pcd)`, in metres in the scene's frame. The numbers are frames without
-            gaps, or times (`io.frame_names`).
-        grippers: name -> CSV, as `io.grippers` reads them.
-        rate_hz: frame rate where neither the CSV has t_s nor the names are times.
+        folder: files `<anything><number>.(npy|ply|xyz|pcd)` [m] in the scene's frame. The numbers are frame numbers
+            without gaps, or times (`io.frame_names`).
+        grippers: gripper name -> CSV file (see `io.grippers`).
+        rate_hz: frame rate, if neither a CSV nor the file names have times.
 
     Raises:
-        EpisodeError: no clouds, a gap in the numbers, a bad or an empty cloud, a CSV that does not match, or times in two
-            places that disagree.
+        EpisodeError: clouds are missing, damaged or empty, frame numbers have gaps, a CSV does not match, or times
+            contradict each other.
     """
     frames, empty = [], []
     named = named_frames(Path(folder), tuple(FORMATS), kind="clouds")
@@ -121,7 +121,7 @@ def cloud_folder(
 def _times(
     named: NamedFrames, stated: NDArray[np.float64] | None, rate_hz: float | None, folder: Path
 ) -> NDArray[np.float64]:
-    """[T] times since the first frame [s]: those that a CSV states, or those in the names, or by the rate."""
+    """[T] times since the first frame [s]: from a CSV, from the file names, or from the frame rate, in this order."""
     if named.times is not None:
         own = named.times - named.times[0]
         if stated is not None and len(own) > 1 and np.abs(stated - own).max() > _SAME_STEP * np.median(np.diff(own)):

@@ -1,4 +1,4 @@
-"""The one place where files of a person are opened: regular files of a sane size, never a pipe that nobody writes to."""
+"""Open input files of the user: only regular files of limited size. A named pipe, for example, would block forever."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import BinaryIO
 from diffcloud.errors import DiffCloudError
 
 MOST_BYTES = 1 << 30
-"""Of one file, and of what it unpacks to. Readers need up to twice as much memory."""
+"""Largest size of a file, and of its decompressed contents. Readers need up to twice this memory."""
 _KINDS = {
     stat.S_IFIFO: "a named pipe",
     stat.S_IFSOCK: "a socket",
@@ -23,19 +23,19 @@ _KINDS = {
 def open_input(
     path: Path, *, kind: str = "file", error: type[DiffCloudError] = DiffCloudError, most_bytes: int = MOST_BYTES
 ) -> BinaryIO:
-    """A stream of a regular file, opened without waiting.
+    """Open a regular file for reading, without blocking.
 
     Args:
-        kind: what the file is, for messages: "gripper file".
-        most_bytes: a larger file is refused before it is read.
+        kind: kind of file, for messages, such as "gripper file".
+        most_bytes: largest accepted size.
 
     Raises:
-        error: missing, not readable, too large, or a folder, pipe, socket or device; the message names the file.
+        error: the path is missing, not readable, too large, or not a regular file (folder, pipe, socket, device).
     """
     path = Path(path)
     try:
-        check_regular(path, os.stat(path), kind, error)  # opening a device may do something to it
-        # a pipe put in its place would not block either
+        check_regular(path, os.stat(path), kind, error)  # before opening: opening a device may have side effects
+        # O_NONBLOCK: do not wait if the file was replaced by a pipe in the meantime.
         stream = os.fdopen(os.open(path, os.O_RDONLY | os.O_NONBLOCK), "rb")
     except FileNotFoundError as missing:
         raise error(f"No such {kind}: {path}.") from missing
@@ -54,10 +54,10 @@ def open_input(
 def check_input(
     path: Path, *, kind: str = "file", error: type[DiffCloudError] = DiffCloudError, most_bytes: int = MOST_BYTES
 ) -> None:
-    """What `open_input` checks, for a library that opens the file by its path.
+    """Make the checks of `open_input`, for a library that opens the file by its path.
 
     Raises:
-        error: as of `open_input`.
+        error: as `open_input`.
     """
     open_input(path, kind=kind, error=error, most_bytes=most_bytes).close()
 
@@ -65,10 +65,10 @@ def check_input(
 def read_input(
     path: Path, *, kind: str = "file", error: type[DiffCloudError] = DiffCloudError, most_bytes: int = MOST_BYTES
 ) -> bytes:
-    """All bytes of a regular file.
+    """Read all bytes of a regular file.
 
     Raises:
-        error: as of `open_input`, or the file is longer than its size says.
+        error: as `open_input`, or the file is longer than its stated size.
     """
     with open_input(path, kind=kind, error=error, most_bytes=most_bytes) as stream:
         try:
@@ -82,10 +82,10 @@ def read_input(
 def read_text(
     path: Path, *, kind: str = "file", error: type[DiffCloudError] = DiffCloudError, most_bytes: int = MOST_BYTES
 ) -> str:
-    """The text of a regular file in UTF-8, lines ended by a line feed.
+    """Read a regular UTF-8 text file. Line ends become line feeds.
 
     Raises:
-        error: as of `read_input`, or not UTF-8.
+        error: as `read_input`, or the text is not UTF-8.
     """
     try:
         text = read_input(path, kind=kind, error=error, most_bytes=most_bytes).decode("utf-8")
@@ -95,9 +95,10 @@ def read_text(
 
 
 def check_regular(path: Path, found: os.stat_result, kind: str, error: type[DiffCloudError]) -> None:
-    """
+    """Check that a path is a regular file.
+
     Raises:
-        error: this is not a regular file.
+        error: the path is something else.
     """
     if not stat.S_ISREG(found.st_mode):
         what = _KINDS.get(stat.S_IFMT(found.st_mode), "not a regular file")
@@ -107,12 +108,13 @@ def check_regular(path: Path, found: os.stat_result, kind: str, error: type[Diff
 def check_size(
     path: Path, size: int, kind: str, error: type[DiffCloudError], most_bytes: int, *, says: str = "has"
 ) -> None:
-    """
+    """Check the size of a file [bytes].
+
     Args:
-        says: what the file does with its size, for the message.
+        says: verb before the size in the message.
 
     Raises:
-        error: a file of this size is not read.
+        error: the file is too large.
     """
     if size > most_bytes:
         raise error(

@@ -1,4 +1,4 @@
-"""Labels of a recording, `KEY=VALUE`: they are kept in episode.json, and in the meta of an imported episode."""
+"""Labels of a recording (`KEY=VALUE`), which are stored in episode.json and in the meta of an imported episode."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ from diffcloud.io.raw_episodes import EpisodeFile
 from diffcloud.io.schema import explain
 
 _KNOWN = frozenset({"scenario", "fabric", "category"})
-"""Fields of episode.json that are labels: the tables of an evaluation and the stages of the pipeline read them."""
+"""Fields of episode.json that are labels. Evaluation tables and pipeline stages use them."""
 _TAKEN = (frozenset(EpisodeFile.model_fields) - _KNOWN) | {
     "trajectory", "viewpoints", "pinholes", "cut_planes", "clocks", "scale_sigma", "pose_sigmas", "quality", "agreement",
     "set_up", "rest_s", "predictions", "noise_free", "category_assumed",
 }  # fmt: skip
-"""Names of facts that commands write and fits read: a label would be taken for the fact."""
+"""Reserved keys. Commands write them and fits read them, so a label of this name would be misinterpreted."""
 
 
 def read_labels(items: Iterable[str]) -> dict[str, str]:
-    """Return ["scenario=lift", ...] as {"scenario": "lift"}.
+    """Parse labels: ["scenario=lift", ...] becomes {"scenario": "lift"}.
 
     Raises:
-        ConfigError: no KEY=VALUE, a key that is given twice, a key of a fact, or a value that the key does not take.
+        ConfigError: an item is not KEY=VALUE, a key occurs twice or is reserved, or a value is invalid for its key.
     """
     labels: dict[str, str] = {}
     for item in items:

@@ -1,4 +1,4 @@
-"""libusb-1.0 for packages whose wheels link to it, on machines that lack it."""
+"""Load libusb-1.0 for packages whose wheels link to it, on systems that lack it."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import ctypes
 
 
 def load_libusb() -> None:
-    """Load the copy in libusb-package; what is imported afterwards and links to libusb-1.0 finds it.
+    """Load the library of libusb-package. Modules imported afterwards that link to libusb-1.0 then find it.
 
     Raises:
         ImportError, OSError: the package is missing, or its library cannot be loaded.

@@ -1,4 +1,4 @@
-"""What a command wrote into a folder, written down there, so that it removes that and nothing else."""
+"""Manifests: a list of the files that a command wrote into a folder, so that it later removes only its own files."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ _LONGEST = 4096
 
 
 def read_manifest(folder: Path) -> set[str]:
-    """Paths relative to the folder, with slashes; empty where there is no manifest.
+    """Return the listed paths relative to the folder, with slashes. Empty if there is no manifest.
 
     Raises:
-        DiffCloudError: damaged.
+        DiffCloudError: the manifest is damaged.
     """
     files = _read(folder).get("files", [])
     if not isinstance(files, list) or not all(isinstance(name, str) and len(name) <= _LONGEST for name in files):
@@ -29,29 +29,29 @@ def read_manifest(folder: Path) -> set[str]:
 
 
 def read_marks(folder: Path) -> dict[str, str]:
-    """Result -> fingerprint of what it was made from, of the finished results; empty where nothing is known.
+    """Return result -> fingerprint of its inputs, for all finished results. Empty if unknown.
 
     Raises:
-        DiffCloudError: damaged.
+        DiffCloudError: the manifest is damaged.
     """
     marks = _read(folder).get("fingerprints", {})
     return {str(name): str(mark) for name, mark in marks.items()} if isinstance(marks, dict) else {}
 
 
 def write_manifest(folder: Path, names: Iterable[str], marks: Mapping[str, str] | None = None) -> None:
-    """State what a command has written, or is going to write.
+    """Write the list of files that a command has written, or is going to write.
 
     Args:
-        marks: see `read_marks`.
+        marks: fingerprints, see `read_marks`.
     """
     told = {} if marks is None else {"fingerprints": dict(sorted(marks.items()))}
     write_json(Path(folder) / NAME, {"files": sorted(names), **told})
 
 
 def remove_manifest(folder: Path) -> None:
-    """Of a folder in which nothing was made; the folder too, where it was all that it held."""
+    """Remove the manifest of a folder without results, and the folder if it is then empty."""
     remove_files(folder, [NAME])
-    with suppress(OSError):  # it has something else in it
+    with suppress(OSError):  # the folder is not empty
         Path(folder).rmdir()
 
 
@@ -62,10 +62,10 @@ def _read(folder: Path) -> dict[str, Any]:
 
 
 def remove_files(folder: Path, names: Iterable[str]) -> list[str]:
-    """Remove files of a folder, as far as they are there, and the folders that this leaves empty; what was removed.
+    """Remove those of the files that exist, and folders that become empty. Return the removed names.
 
     Raises:
-        DiffCloudError: a name that leads out of the folder, or a file that cannot be removed.
+        DiffCloudError: a name leads out of the folder, or a file cannot be removed.
     """
     folder, removed = Path(folder), []
     for name in names:
@@ -80,7 +80,7 @@ def remove_files(folder: Path, names: Iterable[str]) -> list[str]:
             raise DiffCloudError(f"Cannot remove {path}: {error.strerror}.") from error
         removed.append(name)
         for parent in path.relative_to(folder).parents:
-            with suppress(OSError):  # it has something else in it
+            with suppress(OSError):  # the folder is not empty
                 if parent.parts:
                     (folder / parent).rmdir()
     return removed

@@ -1,4 +1,4 @@
-"""Wavefront OBJ with ARCSim's meaning: `v` is a node, `vt` a material-space vert."""
+"""Read and write Wavefront OBJ files as ARCSim defines them: `v` is a node, `vt` a vert in material space."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from diffcloud.io.numbers import number, whole
 from diffcloud.mesh.topology import ClothMesh, SurfaceMesh
 
 _MOST_CORNERS = 100
-"""Of a face: triangulating looks at each of its fans."""
+"""Largest number of corners of a polygon. The triangulation compares all fans, which is slow for many corners."""
 _MOST_BYTES = 100_000_000
 _MOST_STRETCH = 1.5
-"""The published jacket is worn 1.44 times as wide as its pattern, in the median face."""
+"""Largest accepted stretch from material space to the nodes. The published jacket has 1.44 in the median face."""
 STRETCHED = 1.1
-"""Less than this a cloth that hangs may be; more is worth a warning."""
+"""A hanging cloth may stretch by up to this factor. A larger stretch gives a warning."""
 _IGNORED = {"#", "mtllib", "usemtl", "o", "g", "s", "vn", "l"}
 
 
@@ -28,18 +28,18 @@ class _ObjFile:
     nodes: list[list[float]] = field(default_factory=list)
     verts: list[list[float]] = field(default_factory=list)
     polygons: list[list[tuple[int, int]]] = field(default_factory=list)
-    """Corners (node, vert), vert -1 where the file gives none; indices from 0."""
+    """Corners (node, vert), with indices from 0. vert is -1 if the file gives none."""
 
 
 def read_cloth(path: Path) -> ClothMesh:
-    """Read a cloth: nodes from `v`, rest shape from `vt`, seams kept (a node may own several verts).
+    """Read a cloth: nodes from `v`, rest shape from `vt`. Seams are kept, that is, a node may have several verts.
 
-    `vt` is the flat rest shape in the unit of `v`, not the texture coordinates of a picture. A corner without `vt` takes
+    `vt` is the flat rest shape in the unit of `v`, not the texture coordinates of an image. A corner without `vt` takes
     the node's first vert, or a new one at (x, y) of the node.
 
     Raises:
-        MeshError: an unreadable line, an index out of range, a mesh that cannot be simulated, or edges whose lengths in
-            the rest shape and between the nodes differ by more than a factor of 1.5.
+        MeshError: a line or index is invalid, or the mesh cannot be simulated. Also if edge lengths in the rest shape
+            and between the nodes differ by more than a factor of 1.5.
     """
     obj = _parse(path)
     verts = list(obj.verts)
@@ -83,9 +83,9 @@ def read_cloth(path: Path) -> ClothMesh:
 
 
 def other_lengths(mesh: ClothMesh) -> tuple[float, str]:
-    """(factor, message): by how much edges between the nodes are longer or shorter than in the rest shape, and what to do.
+    """Compare the lengths between the nodes with the rest shape. Return a stretch factor and advice to the user.
 
-    The factor is that of the principal stretches in the median face, at least 1.
+    The factor is the larger of the median principal stretches (or their inverses) over all faces. It is at least 1.
     """
     corner = mesh.nodes[mesh.faces]
     edges = np.stack([corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]], axis=-1)  # [F, 3, 2]
@@ -104,10 +104,10 @@ def other_lengths(mesh: ClothMesh) -> tuple[float, str]:
 
 
 def read_surface(path: Path) -> SurfaceMesh:
-    """Read an obstacle: nodes and triangles, material space ignored.
+    """Read the triangle mesh of an obstacle. Its `vt` lines are ignored.
 
     Raises:
-        MeshError: an unreadable line, an index out of range, or no faces.
+        MeshError: a line is not readable, an index is out of range, or there are no faces.
     """
     obj = _parse(path)
     faces = []
@@ -120,7 +120,7 @@ def read_surface(path: Path) -> SurfaceMesh:
 
 
 def write_cloth(path: Path, mesh: ClothMesh, nodes: np.ndarray | None = None) -> None:
-    """Write a cloth with its material space; `nodes` [V, 3] replaces the initial positions. Floats keep all digits."""
+    """Write a cloth with its material space. `nodes` [V, 3] replaces the node positions. Floats keep all digits."""
     positions = mesh.nodes if nodes is None else nodes
     lines = [f"v {x!r} {y!r} {z!r}" for x, y, z in np.asarray(positions, dtype=np.float64).tolist()]
     lines += [f"vt {u!r} {v!r}" for u, v in mesh.verts.tolist()]
@@ -182,7 +182,7 @@ def _corner(word: str) -> tuple[int, int]:
 
 
 def _fan(corners: list[int], positions: np.ndarray) -> list[list[int]]:
-    """Triangulate a polygon from the corner whose fan has the largest smallest angle; the first wins ties."""
+    """Triangulate a polygon as a fan. The fan with the largest minimum angle is chosen, the first one in a tie."""
     count = len(corners)
     if count == 3:
         return [corners]

@@ -1,6 +1,6 @@
-"""Reading PCD files, the format of the Point Cloud Library: ascii, binary and binary_compressed, all field types.
+"""Read PCD files (Point Cloud Library): ascii, binary and binary_compressed, with all field types.
 
-Only x, y and z are returned. The VIEWPOINT, where the sensor stood, is not applied, as PCL and open3d do not apply it.
+Only x, y and z are returned. As in PCL and open3d, the VIEWPOINT (sensor pose) is not applied.
 """
 
 from __future__ import annotations
@@ -15,29 +15,29 @@ from numpy.typing import NDArray
 from diffcloud.errors import EmptyCloudError, EpisodeError
 
 _HEADER = 65_536
-"""[B] Length that no header exceeds."""
+"""Largest header [bytes]."""
 _LZF_GAIN = 88
-"""LZF expands data at most by this factor."""
+"""Largest compression ratio of LZF."""
 _TYPES = {"F": (4, 8), "I": (1, 2, 4, 8), "U": (1, 2, 4, 8)}
-"""Sizes in bytes of each TYPE."""
+"""TYPE -> allowed sizes [bytes]."""
 
 
 @dataclass(frozen=True)
 class _Header:
     layout: np.dtype[Any]
-    """Of one point. Fields are named by their position, since PCL repeats the name `_` for padding."""
+    """Layout of one point. Fields are named by their index, because PCL repeats the name `_` for padding."""
     axes: tuple[int, int, int]
-    """Positions of x, y and z."""
+    """Field indices of x, y and z."""
     points: int
     kind: str
 
 
 def read_pcd(path: Path) -> NDArray[np.float64]:
-    """[N, 3] points of a PCD file. Points with NaN are left out: PCL marks pixels without a measurement so.
+    """Read the points [N, 3] of a PCD file. Points with NaN, which PCL uses for missing measurements, are dropped.
 
     Raises:
-        EpisodeError: a damaged header, no fields x, y, z, a field type that PCD lacks, or data that end early;
-            nothing but NaN (`EmptyCloudError`).
+        EpisodeError: the header is damaged, x, y or z is missing, a field type is unknown, the data end early, or all
+            points are NaN (`EmptyCloudError`).
     """
     with path.open("rb") as stream:
         header = _read_header(stream, path)
@@ -99,7 +99,7 @@ def _read_header(stream: BinaryIO, path: Path) -> _Header:
 
 
 def axis_field(names: list[str], axis: str) -> int | None:
-    """Position of a coordinate among the fields of a file, in lower case or else in upper case; None if it is not there."""
+    """Return the index of a coordinate among field names, in lower or upper case, or None."""
     return next((names.index(name) for name in (axis, axis.upper()) if name in names), None)
 
 
@@ -119,7 +119,7 @@ def _text(stream: BinaryIO, header: _Header, path: Path) -> list[NDArray[Any]]:
 
 
 def _compressed(data: bytes, header: _Header, path: Path) -> list[NDArray[Any]]:
-    """LZF of the fields one after the other, each of all points; before it, its size and that of the result."""
+    """Decompress LZF data: field after field, each for all points. Two integers before them are the sizes."""
     packed, size = (int.from_bytes(data[start : start + 4], "little") for start in (0, 4))
     if size != header.points * header.layout.itemsize or len(data) < 8 + packed:
         raise EpisodeError(f"{path}: its compressed data are cut off, or do not fit its header.")
@@ -135,19 +135,19 @@ def _compressed(data: bytes, header: _Header, path: Path) -> list[NDArray[Any]]:
 
 
 def lzf_decompressed(data: bytes, size: int) -> bytes:
-    """Bytes that LibLZF packed.
+    """Decompress LibLZF data.
 
     Args:
-        size: of the result [B].
+        size: expected size of the result [bytes].
 
     Raises:
-        ValueError: damaged, or of another size.
+        ValueError: the data are damaged, or the result has another size.
     """
     result, place = bytearray(), 0
     while place < len(data) and len(result) <= size:
         control = data[place]
         place += 1
-        if control < 32:  # that many bytes, plus one, as they are
+        if control < 32:  # control + 1 literal bytes
             result += data[place : place + control + 1]
             place += control + 1
             continue
@@ -163,7 +163,7 @@ def lzf_decompressed(data: bytes, size: int) -> bytes:
         if start < 0:
             raise ValueError("a reference leads before the beginning")
         copied = result[start : start + length]
-        result += (copied * (length // len(copied) + 1))[:length]  # may overlap what it makes
+        result += (copied * (length // len(copied) + 1))[:length]  # the copy may overlap its own output
     if place > len(data) or len(result) != size:
         raise ValueError(f"{len(result)} bytes instead of {size}")
     return bytes(result)

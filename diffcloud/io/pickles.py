@@ -1,8 +1,8 @@
-"""Reading `.npy` files of strangers: plain arrays, and the pickled dictionaries of arrays that the published data have.
+"""Read `.npy` files from untrusted sources: plain arrays, and pickled dictionaries of arrays as in the published data.
 
-A pickle is a program, so none is run. The few instructions that such dictionaries are written with are interpreted here on
-plain values: what would be a call of numpy stays a note, and an array is made from its bytes only if type, shape and number
-of bytes agree. Every other instruction is refused by name. Sizes are checked before memory is taken.
+Unpickling can run arbitrary code, so no pickle is loaded. Instead, this module interprets only the pickle instructions
+that such dictionaries need. A call of numpy is recorded, not executed. An array is built from its bytes only if type,
+shape and number of bytes agree. Other instructions are refused. Sizes are checked before memory is allocated.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from diffcloud.io.inputs import read_input
 
 _LARGEST_BYTES = 256 * 2**20
 _LARGEST_PICKLE_BYTES = 4 * 2**20
-"""The published ones have less than a thousand."""
+"""Limit for a pickle. The published ones have less than a thousand bytes."""
 _DEEPEST = 16
 
 
@@ -32,7 +32,7 @@ def load_npy(path: Path) -> Any:
     """Read an `.npy` file: a plain array, or a pickled object made of plain containers, numbers, strings and arrays.
 
     Raises:
-        EpisodeError: missing, too large, damaged, or a pickle that carries anything else.
+        EpisodeError: the file is missing, too large or damaged, or its pickle has other contents.
     """
     path = Path(path)
     data = read_input(path, error=EpisodeError, most_bytes=_LARGEST_BYTES)
@@ -51,22 +51,22 @@ def load_npy(path: Path) -> Any:
 
 
 class _Refused(Exception):
-    """What a file is, or carries, that is not read."""
+    """The file cannot be read. The message continues a sentence that starts with the path."""
 
 
 @dataclass
 class _Call:
-    """A name that a pickle refers to, or what its call would give, once the arguments are known."""
+    """A numpy function or type in a pickle, with the arguments of its call. The call is recorded, not executed."""
 
     name: str
     arguments: tuple[Any, ...] = ()
     state: Any = None
     done: Any = None
-    """The array, once it is made."""
+    """Result of the call, once it has been computed."""
 
 
 def _array(kind: np.dtype[Any], shape: Any, fortran: bool, content: bytes) -> NDArray[Any]:
-    """An array of its own memory, if the content is exactly as long as it must be."""
+    """Build an array in new memory. The content must have exactly the expected length."""
     whole = isinstance(shape, tuple) and all(isinstance(length, int) and length >= 0 for length in shape)
     if not whole or len(shape) > MOST_DIMENSIONS or not readable(kind):
         raise _Refused(
@@ -78,12 +78,12 @@ def _array(kind: np.dtype[Any], shape: Any, fortran: bool, content: bytes) -> ND
         raise _Refused(f"is damaged: {shape} values of {kind} take {wanted} bytes, it has {len(content)}")
     try:
         return np.frombuffer(content, kind).reshape(shape, order="F" if fortran else "C").copy()
-    except ValueError as error:  # a dimension of any length beside one of zero
+    except ValueError as error:  # a shape such as (0, 2**63) passes the size check but is no valid shape
         raise _Refused(f"is damaged: {error}") from error
 
 
 def _unpickled(content: bytes, shape: tuple[int, ...]) -> Any:
-    """The one object of an array of shape ()."""
+    """Return the single object in a pickled array of shape ()."""
     if shape != ():
         raise _Refused(f"holds an array of objects of shape {shape}; only a single dictionary or list is read")
     if len(content) > _LARGEST_PICKLE_BYTES:
@@ -106,12 +106,12 @@ _NAMES = {
     "numpy._core.multiarray.scalar": "scalar",
     "_codecs.encode": "encode",
 }
-"""What a pickle may refer to, as it is noted here."""
+"""Names that a pickle may refer to -> kind of the recorded call."""
 _MARK = object()
 
 
 def _interpreted(operations: Iterator[tuple[Any, Any, Any]]) -> Any:
-    """The object that a pickle describes, with calls as notes."""
+    """Interpret the instructions of a pickle and return its object, in which calls are `_Call` records."""
     stack: list[Any] = []
     memo: dict[int, Any] = {}
     try:
@@ -158,7 +158,7 @@ def _interpreted(operations: Iterator[tuple[Any, Any, Any]]) -> Any:
                     memo[len(memo) if argument is None else argument] = stack[-1]
                 case "BINGET" | "LONG_BINGET":
                     known = memo[argument]
-                    # shared containers could unfold to any size
+                    # Repeated containers could expand to any size.
                     if isinstance(known, list | dict) or (isinstance(known, tuple) and not all(map(_is_scalar, known))):
                         raise _Refused("refers to one container twice; only plain nesting is read")
                     stack.append(known)
@@ -174,7 +174,7 @@ def _interpreted(operations: Iterator[tuple[Any, Any, Any]]) -> Any:
 
 
 def _since_mark(stack: list[Any]) -> list[Any]:
-    """What was pushed since the last mark; both are taken off."""
+    """Pop and return the values above the topmost mark, and pop the mark."""
     begin = len(stack) - 1 - next(index for index, value in enumerate(reversed(stack)) if value is _MARK)
     items = stack[begin + 1 :]
     del stack[begin:]
@@ -182,7 +182,7 @@ def _since_mark(stack: list[Any]) -> list[Any]:
 
 
 def _plain(value: Any, depth: int = 0) -> Any:
-    """Containers, numbers, strings and arrays, with the notes carried out."""
+    """Replace all recorded calls in nested containers by their results."""
     if depth > _DEEPEST:
         raise _Refused(f"is nested more than {_DEEPEST} deep")
     if isinstance(value, _Call):
@@ -203,7 +203,7 @@ def _is_scalar(value: Any) -> bool:
 
 
 def _carried_out(call: _Call, depth: int) -> Any:
-    """The array, number or bytes that a note stands for."""
+    """Return the array, number or bytes that a recorded call gives."""
     if call.done is not None:
         return call.done
     try:
@@ -216,7 +216,7 @@ def _carried_out(call: _Call, depth: int) -> Any:
                 call.done = _array(_dtype(kind), (), False, _plain(content, depth + 1))[()]
             case "reconstruct":
                 _, shape, kind, fortran, content = call.state
-                if _dtype_name(kind).startswith("O"):  # the outermost array, whose elements follow as a list
+                if _dtype_name(kind).startswith("O"):  # the outer object array; its elements follow as a list
                     if not isinstance(content, list):
                         raise _Refused("holds objects as bytes; these would be forged pointers")
                     call.done = _plain(content, depth + 1)
@@ -236,7 +236,7 @@ def _dtype_name(call: Any) -> str:
 
 
 def _dtype(call: Any) -> np.dtype[Any]:
-    """The element type, in the byte order that the state tells."""
+    """Return the element type, in the byte order of the call's state."""
     kind = np.dtype(_dtype_name(call))
     if kind.kind not in ELEMENTS:
         raise _Refused(f"holds an array of {kind}; only numbers and strings are read")

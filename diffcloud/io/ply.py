@@ -1,7 +1,7 @@
-"""Reading the points of PLY files: ascii and binary of both byte orders, any elements and properties.
+"""Read the points of PLY files: ASCII and binary in both byte orders, with any elements and properties.
 
-Only x, y and z of the element `vertex` are returned. What follows that element is not looked at, and no file that the
-header names, such as a texture, is opened.
+Only x, y and z of the element `vertex` are returned. Later elements are ignored, and files that the header names, such
+as textures, are not opened.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from diffcloud.errors import EpisodeError
 from diffcloud.io.pcd import axis_field
 
 _HEADER = 65_536
-"""[B] Length that no header exceeds."""
+"""Largest header [bytes]."""
 _TYPES = {
     **dict.fromkeys(("char", "int8"), "i1"),
     **dict.fromkeys(("uchar", "uint8"), "u1"),
@@ -39,14 +39,14 @@ class _Element:
     count: int
     names: list[str] = field(default_factory=list)
     types: list[tuple[str, ...]] = field(default_factory=list)
-    """numpy's code of a property; of a list, the codes of its length and of its entries."""
+    """NumPy type code of each property. A list property has two: of its length and of its entries."""
 
 
 def read_ply(path: Path) -> NDArray[np.float64]:
-    """[N, 3] vertices of a PLY file, in its order.
+    """Read the vertices [N, 3] of a PLY file, in file order.
 
     Raises:
-        EpisodeError: a damaged header, no vertices with x, y and z, or vertices that the file does not hold.
+        EpisodeError: the header is damaged, vertices have no x, y and z, or the file is too short.
     """
     data = path.read_bytes()
     try:
@@ -61,7 +61,7 @@ def read_ply(path: Path) -> NDArray[np.float64]:
     if any(axis is None or len(vertex.types[axis]) > 1 for axis in axes):
         raise EpisodeError(f"{path}: its vertices have {', '.join(vertex.names) or 'no properties'}; they need x, y and z.")
     columns = [axis for axis in axes if axis is not None]
-    least = sum(element.count for element in (*before, vertex))  # bytes: each element takes one or more
+    least = sum(element.count for element in (*before, vertex))  # [bytes] each element takes at least one
     if least > len(data) - start:
         raise EpisodeError(f"{path} states {vertex.count} points and is too short for them: it was cut off.")
     try:
@@ -77,11 +77,11 @@ def read_ply(path: Path) -> NDArray[np.float64]:
 
 
 class _CutOffError(Exception):
-    """How many vertices are there."""
+    """The file ends too early. The argument is the number of vertices found."""
 
 
 def _header(data: bytes) -> tuple[str, list[_Element], int]:
-    """(byte order, empty for text; elements; where the data start)."""
+    """Parse the header. Return the byte order (empty for ASCII), the elements, and the offset of the data."""
     if not data.startswith(b"ply"):
         raise ValueError("it does not start with ply")
     newline = b"\r\n" if data[3:5] == b"\r\n" else data[3:4]
@@ -117,14 +117,14 @@ def _header(data: bytes) -> tuple[str, list[_Element], int]:
 
 
 def _layout(element: _Element, order: str) -> np.dtype[Any] | None:
-    """Of one entry; None where its size depends on lists."""
+    """Return the NumPy type of one entry, or None if its size varies because of list properties."""
     if any(len(codes) > 1 for codes in element.types):
         return None
     return np.dtype([(str(index), order + codes[0]) for index, codes in enumerate(element.types)])
 
 
 def _skipped(data: bytes, start: int, element: _Element, order: str) -> int:
-    """Where the data after an element start."""
+    """Return the offset of the data that follow an element."""
     layout = _layout(element, order)
     if layout is not None:
         return start + element.count * layout.itemsize
@@ -134,7 +134,7 @@ def _skipped(data: bytes, start: int, element: _Element, order: str) -> int:
 
 
 def _walked(data: bytes, start: int, element: _Element, order: str) -> list[int]:
-    """Where each property of one entry starts, and where the next entry does."""
+    """Return the offset of each property of one entry, and of the next entry."""
     places = [start]
     for codes in element.types:
         size = np.dtype(codes[-1]).itemsize
@@ -170,7 +170,7 @@ def _from_bytes(data: bytes, start: int, vertex: _Element, order: str, axes: lis
 
 
 def _from_text(data: bytes, before: list[_Element], vertex: _Element, axes: list[int]) -> NDArray[np.float64]:
-    """Entries are runs of numbers; line breaks between them do not count."""
+    """Read vertices from ASCII data. Numbers are separated by any white space; line breaks have no meaning."""
     words = data.split()
     place = 0
     for element in before:
@@ -194,7 +194,7 @@ def _from_text(data: bytes, before: list[_Element], vertex: _Element, axes: list
 
 
 def _read_words(words: list[bytes], place: int, element: _Element) -> list[int]:
-    """Where each property of one entry starts, and where the next entry does."""
+    """Return the word index of each property of one entry, and of the next entry."""
     places = [place]
     for codes in element.types:
         length = 1

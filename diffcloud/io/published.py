@@ -1,9 +1,9 @@
-"""The gripper's tracks published with the paper, and its real recordings in metres and seconds, with cameras and track.
+"""The published gripper tracks, and the real published recordings in metres and seconds with gripper and cameras.
 
-The published scenes look at one frame and move their handle along a path of their own. Here a lift or fold is what was
-recorded: clouds in metres, of a 10 Hz motion whose gripper was where the published track says. The track is in the robot's
-frame. The clouds' frame is turned against it by 90° about the vertical. The camera set-up says where its origin lies, if
-that is known. Otherwise it was found from the clouds' highest points, which go along with the track.
+The published scenes use one frame only and move the gripper along a simplified path. In contrast, `recorded_episode`
+returns a lift or fold as recorded: clouds in metres at 10 Hz, and the published gripper track. The track is in the
+robot's frame. The clouds' frame is rotated by 90° about the vertical relative to it. Its origin is taken from the
+camera setup, if known. Otherwise it was estimated from the clouds' highest points, which move with the gripper.
 """
 
 from __future__ import annotations
@@ -23,63 +23,63 @@ from diffcloud.io.pickles import load_npy
 from diffcloud.io.published_cameras import SetUp, published_set_ups, recognised
 
 RELEASE_UNIT_M = 0.35
-"""One length unit of the published recordings [m]."""
+"""Length unit of the published recordings [m]."""
 PAPER_THRESHOLD = 5e-4
-"""Stop below this one-sided Chamfer loss, in squared length units of the release (paper, section IV-F)."""
+"""Stop threshold of the one-sided Chamfer loss, in squared length units of the release (paper, section IV-F)."""
 RECORDED_RATE_HZ = 10.0
-"""Of the robot's commands and of the clouds (paper, section IV-D): row j of a track is where the gripper was in cloud j."""
+"""Rate of robot commands and clouds (paper, section IV-D). Row j of a track is the gripper position in cloud j."""
 RECORDED_START_M: Mapping[str, tuple[float, float, float]] = MappingProxyType(
     {"lift": (0.0, 0.105, 0.0), "fold": (0.0, -0.286, -0.033)}
 )
-"""Kind of motion -> x and y of the gripper at the start of its scenario, about a centimetre from the held corner at most,
-and what to add to the robot's z where the clouds' place in the robot's frame is unknown [m]."""
+"""Motion -> (x, y, offset of z) [m]. x and y are the gripper's start in the scene, at most about 1 cm from the grasped
+corner. The offset is added to the robot's z if the clouds' origin in the robot's frame is unknown."""
 _POSE_SIGMAS: Mapping[bool, Mapping[str, float]] = MappingProxyType(
     {
         True: {"x": 0.01, "y": 0.01, "yaw": math.radians(1)},
         False: {"x": 0.03, "y": 0.03, "yaw": math.radians(20)},
     }
 )
-"""Whether the clouds' place in the robot's frame is known -> standard deviations of where the cloth's held corner and the
-gripper's track are [m, rad]. Known: the fingers hold the cloth up to a centimetre from its corner."""
+"""Whether the clouds' origin in the robot's frame is known -> prior standard deviations of the pose [m, rad]. Even if
+it is known, the fingers hold the cloth up to 1 cm from its corner."""
 _SCALE_SIGMA = 0.02
-"""By what fraction distances in the clouds may be off: what the cameras' data sheet allows. In the published calibration
-images, the board is 3 to 6 % too large; but what the clouds themselves were made with was not published, so the prior is
-about zero."""
+"""Prior standard deviation of the clouds' scale, as a fraction (from the cameras' data sheet). In the published
+calibration images the board is 3 to 6 % too large. But the calibration used for the clouds is unpublished, so the prior
+mean is 0."""
 _FARTHEST_M = 5.0
-"""No arm of one piece reaches farther: such numbers are millimetres."""
+"""Largest reach of an arm [m]. Larger numbers are probably millimetres."""
 
 
 def read_trajectories(folder: Path, kinds: tuple[str, ...]) -> dict[str, NDArray[np.float64]]:
-    """The published tracks of these kinds of motion: kind -> [T, 3] positions in the robot's frame, z up [m].
+    """Read the published gripper tracks: motion -> [T, 3] positions in the robot's frame, z up [m].
 
     Args:
-        folder: holds `<kind>_traj.npy`, plain arrays [T, 3], one row a frame. They are never unpickled.
-        kinds: keys of `RECORDED_START_M`.
+        folder: folder with `<kind>_traj.npy`, plain arrays [T, 3]. They are never unpickled.
+        kinds: motions, keys of `RECORDED_START_M`.
 
     Raises:
-        EpisodeError: a file that is missing, damaged, of another shape, not finite, or not in metres.
+        EpisodeError: a file is missing, damaged, of another shape, not finite, or not in metres.
     """
     return {kind: _read_track(Path(folder) / f"{kind}_traj.npy") for kind in kinds}
 
 
 def recorded_episode(kind: str, name: str, published: Episode, track: NDArray[np.float64]) -> Episode:
-    """A published recording in metres and seconds, with its gripper, and with its cameras if their set-up is known.
+    """Return a published recording in metres and seconds, with its gripper track, and with its cameras if known.
 
     Args:
-        kind: key of `RECORDED_START_M`.
-        name: of the recording, for errors.
+        kind: motion, a key of `RECORDED_START_M`.
+        name: name of the recording, for messages.
         published: T frames in units of the release.
         track: [T, 3] in the robot's frame [m].
 
     Returns:
-        Points [m] and the gripper's positions [T, 1, 3] [m] in the scenario's frame, times from 0 [s], and if the set-up is
-        known, camera and pixel of each point. The published predictions are left out: they are multipliers of another
-        scene. The meta says how far scale and pose may be off (`scale_sigma`, `pose_sigmas`). Of a known set-up, it has
-        `set_up`, `cameras`, `viewpoints`, `pinholes`, and `clouds_shift_m`, which was added to the clouds. With this shift,
-        the gripper starts where the scenario's does.
+        Episode with points [m] and gripper positions [T, 1, 3] [m] in the scene's frame, and times from 0 [s]. The meta
+        has the prior standard deviations of scale and pose (`scale_sigma`, `pose_sigmas`). If the camera setup is
+        known, points have camera and pixel, and the meta has `set_up`, `cameras`, `viewpoints`, `pinholes` and
+        `clouds_shift_m`. This shift was added to the clouds so that the gripper starts as in the scene. Published
+        predictions are dropped, since they are multipliers of another scene.
 
     Raises:
-        EpisodeError: the track has another number of rows than the recording has frames.
+        EpisodeError: the track and the recording differ in the number of frames.
     """
     if len(track) != published.frame_count:
         raise EpisodeError(
@@ -108,10 +108,11 @@ def recorded_episode(kind: str, name: str, published: Episode, track: NDArray[np
 
 
 def _with_cameras(episode: Episode, points: NDArray[np.float64], set_up: SetUp, shift: NDArray[np.float64]) -> Episode:
-    """
+    """Add the cameras of a setup to an episode, and drop points that none of them saw.
+
     Args:
-        points: [P, 3] of the episode in the clouds' frame [m].
-        shift: [3] added to them [m].
+        points: [P, 3] points of the episode in the clouds' frame [m].
+        shift: [3] vector that was added to them [m].
     """
     camera, pixel = set_up.seen(points)
     pinholes = {name: _shifted(pinhole, shift) for name, pinhole in set_up.pinholes.items()}
@@ -137,7 +138,7 @@ def _shifted(pinhole: Pinhole, shift: NDArray[np.float64]) -> Pinhole:
 
 
 def in_clouds_frame(kind: str, track: NDArray[np.float64]) -> NDArray[np.float64]:
-    """A track [T, 3] in the robot's frame [m] as one [T, 3] in the scenario's frame [m], by a rotation and a shift."""
+    """Transform a track [T, 3] from the robot's frame to the scene's frame [m], by a rotation and a translation."""
     way = track - track[0]
     x, y, lift = RECORDED_START_M[kind]
     return np.stack([x + way[:, 1], y - way[:, 0], track[:, 2] + lift], axis=1)

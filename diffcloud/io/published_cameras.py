@@ -1,8 +1,8 @@
-"""Which camera saw each point of the published real recordings.
+"""Find out which camera saw each point of the published real recordings.
 
-A published cloud joins the depth images of two cameras. Depths are whole millimetres and image coordinates are whole
-pixels, so with the right camera pose, each point has whole coordinates in its image. The recordings have several
-camera set-ups, listed in `published_cameras.json`. A recording has the set-up that gives all its points whole coordinates.
+A published cloud merges the depth images of two cameras. Depths are whole millimetres and image coordinates are whole
+pixels. So with the right camera pose, each point has whole coordinates in its image. `published_cameras.json` lists the
+camera setups of the recordings. A recording has the setup for which all its points have whole coordinates.
 """
 
 from __future__ import annotations
@@ -19,24 +19,24 @@ from diffcloud.io.episodes import Pinhole
 from diffcloud.io.files import read_json
 
 _WHOLE = 0.02
-"""Pixels and millimetres by which the coordinates of a recorded point may differ from whole numbers. With a wrong pose, one
-point in 16,000 is as close by chance."""
+"""Tolerance for whole coordinates [px, mm]. With a wrong pose, one point in 16,000 meets it by chance."""
 _RECOGNISED = 0.98
-"""Part of the points that a camera of the set-up must have seen."""
+"""Fraction of the points that must fit a camera of the setup."""
 
 
 @dataclass(frozen=True)
 class SetUp:
-    """Cameras of some recordings, and where the robot stood."""
+    """Camera setup of some recordings, and the robot's position."""
 
     name: str
     pinholes: dict[str, Pinhole]
-    """Camera -> its image and its pose in the clouds' frame [m]."""
+    """Camera name -> intrinsics and pose in the clouds' frame [m]."""
     robot_to_clouds_m: NDArray[np.float64] | None
-    """[3] (x, y, z): a point r of the robot's frame is (r_y + x, y - r_x, r_z + z) in the clouds' frame; None: unknown."""
+    """[3] (x, y, z): robot point r is (r_y + x, y - r_x, r_z + z) in the clouds' frame. None if unknown."""
 
     def seen(self, points: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Camera [N] (its number, or -1) and pixel [N, 2] (column, row) of points [N, 3] in the clouds' frame [m]."""
+        """Return camera index [N] (-1 for none) and pixel [N, 2] (column, row) of points [N, 3] in the clouds' frame
+        [m]."""
         camera, pixel, least = (
             np.full(len(points), -1),
             np.zeros((len(points), 2), dtype=np.int64),
@@ -56,7 +56,7 @@ class SetUp:
 
 @cache
 def published_set_ups() -> tuple[SetUp, ...]:
-    """All known set-ups."""
+    """Return all known camera setups."""
     with as_file(files("diffcloud.io") / "published_cameras.json") as path:
         told = read_json(path)
     width, height = told["size"]
@@ -74,7 +74,7 @@ def published_set_ups() -> tuple[SetUp, ...]:
 
 
 def recognised(points: NDArray[np.float64], set_ups: Iterable[SetUp]) -> SetUp | None:
-    """The set-up whose cameras saw points [N, 3] in the clouds' frame [m], or None."""
+    """Return the setup whose cameras saw points [N, 3] in the clouds' frame [m], or None."""
     for set_up in set_ups:
         if (set_up.seen(points)[0] >= 0).mean() >= _RECOGNISED:
             return set_up

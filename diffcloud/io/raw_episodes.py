@@ -1,4 +1,4 @@
-"""Raw episodes: what cameras and arm recorded, as a folder of plain files.
+"""Read and write raw episodes: folders of depth images and joint angles.
 
     episode.json                      schema version, scenario, labels, rate, cameras, robot, source, units, status
     cameras/<cam>/camera.json         intrinsics, depth_scale_m, T_world_camera (or a calibration file), serial
@@ -7,9 +7,10 @@
     cameras/<cam>/color/000000.png
     robot.csv                         t_s, joint_1.. [rad], gripper [0..1], tool_x..z [m], tool_qw..qz, wrench [N, N·m]
 
-All times are seconds of one clock since the start of the recording. `RawEpisodeWriter` writes while the recording runs: the
-images of a frame first, whole and renamed, then its row in timestamps.csv, flushed to the disk. So a row is a promise, and
-what a crash or power cut leaves is a shorter episode: images without a row and a torn last line are ignored.
+All times are seconds of one clock since the start of the recording. `RawEpisodeWriter` writes during the recording. It
+writes the images of a frame first, and then the frame's row in timestamps.csv. A frame is valid only if it has a
+complete row, so a crash leaves a shorter but valid episode: readers ignore images without a row and an incomplete last
+line.
 """
 
 from __future__ import annotations
@@ -42,19 +43,19 @@ _FILES = re.compile(
     r"episode\.json|robot\.csv|cameras/[^/]+/(camera\.json|timestamps\.csv|(depth|color)/\d+\.png)"
     r"|truth/(cameras\.json|cloth\.npz|[^/]+/\d+\.png)"
 )
-"""Relative paths of a raw episode's files, with the truth of a synthetic one."""
+"""Pattern of the relative paths of a raw episode's files. `truth/` exists in synthetic episodes only."""
 _TOOL = ("tool_x", "tool_y", "tool_z", "tool_qw", "tool_qx", "tool_qy", "tool_qz")
 _LATEST_S = 1e6
 MOST_HZ = 1e5
-"""Of frames."""
+"""Highest frame rate that is accepted [Hz]."""
 _FARTHEST_RAD, _LARGEST = 200.0, 1e5
-"""Of joints that turn without end; and of any other number, which `data check` may yet find to be in another unit."""
+"""Largest accepted joint angle [rad] (continuous joints may turn many times), and value of other columns."""
 _WRENCH = ("wrench_fx", "wrench_fy", "wrench_fz", "wrench_tx", "wrench_ty", "wrench_tz")
 
 
 @dataclass(frozen=True)
 class CameraInfo:
-    """camera.json."""
+    """A camera of a raw episode, as `camera.json` describes it."""
 
     name: str
     serial: str
@@ -62,11 +63,11 @@ class CameraInfo:
     depth_scale_m: float
     """Metres per unit of the depth image."""
     T_world_camera: NDArray[np.float64] | None = None
-    """[4, 4] maps camera points to world points [m]; None: not calibrated yet, or in the calibration file."""
+    """[4, 4] camera-to-world transform [m]. None if the camera is not calibrated yet or `calibration` names a file."""
     calibration: str | None = None
     """Path of a calibration file, relative to the episode's folder."""
     settings: Mapping[str, float] = field(default_factory=dict)
-    """What the camera was set to while it recorded, where that is known: option -> value, such as depth.exposure."""
+    """Camera options during the recording, such as `depth.exposure`. Empty if unknown."""
 
     def to_json(self) -> dict[str, Any]:
         told = {
@@ -90,9 +91,10 @@ def _plain_word(name: str) -> str:
 
 
 def _depth_scale(scale: float) -> float:
-    """
+    """Return a valid depth scale [m per unit].
+
     Raises:
-        ValueError: of no depth camera.
+        ValueError: the scale is outside the range of depth cameras.
     """
     if not 1e-6 <= scale <= 0.02:
         raise ValueError("it is metres per unit of the image, for a D435 0.001 (one millimetre)")
@@ -100,7 +102,7 @@ def _depth_scale(scale: float) -> float:
 
 
 class CameraFile(Checked):
-    """camera.json."""
+    """Schema of `camera.json`."""
 
     name: Name | None = None
     serial: Name
@@ -118,7 +120,7 @@ class CameraFile(Checked):
 
 
 class PlacementFile(Checked):
-    """`ScenePlacement`."""
+    """Schema of `scene_in_world` in `episode.json`; see `ScenePlacement`."""
 
     origin_m: Vector = (0.0, 0.0, 0.0)
     yaw_rad: Annotated[float, Field(ge=-100, le=100)] = 0.0
@@ -126,7 +128,7 @@ class PlacementFile(Checked):
 
 
 class EpisodeFile(Plain):
-    """episode.json. Labels of one's own may stand beside these fields."""
+    """Schema of `episode.json`. Further keys are allowed as the user's own labels."""
 
     model_config = ConfigDict(frozen=True, extra="allow")
 
@@ -164,13 +166,13 @@ class EpisodeFile(Plain):
 
 @dataclass(frozen=True)
 class RobotSample:
-    """One row of robot.csv. What a source does not know is None."""
+    """One row of robot.csv. A quantity that the source does not measure is None."""
 
     t_s: float
     joints_rad: NDArray[np.float64]
-    """[J]."""
+    """[J] joint angles."""
     gripper: float | None = None
-    """0 open to 1 closed, as the arm reports it."""
+    """Gripper opening, from 0 (open) to 1 (closed)."""
     tool_position_m: NDArray[np.float64] | None = None
     """[3] in the robot's base frame."""
     tool_quaternion: NDArray[np.float64] | None = None
@@ -181,63 +183,63 @@ class RobotSample:
 
 @dataclass(frozen=True)
 class RobotLog:
-    """robot.csv: NaN where a source knows nothing."""
+    """Contents of robot.csv, N rows and J joints. Missing values are NaN."""
 
     times: NDArray[np.float64]
     """[N] [s]."""
     joints_rad: NDArray[np.float64]
     """[N, J]."""
     gripper: NDArray[np.float64]
-    """[N] 0..1."""
+    """[N] from 0 (open) to 1 (closed)."""
     tool_position_m: NDArray[np.float64]
-    """[N, 3]."""
+    """[N, 3] in the robot's base frame."""
     tool_quaternion: NDArray[np.float64]
     """[N, 4] (w, x, y, z)."""
     wrench: NDArray[np.float64]
-    """[N, 6]."""
+    """[N, 6] external force [N] and torque [N·m] at the tool."""
 
 
 @dataclass(frozen=True)
 class RawCamera:
-    """One camera of a raw episode; images are read when they are asked for."""
+    """One camera of a raw episode. Images are read from disk on each call."""
 
     info: CameraInfo
     folder: Path
     frames: NDArray[np.int64]
-    """[T] numbers of the files."""
+    """[T] file numbers of the frames."""
     times: NDArray[np.float64]
     """[T] [s]."""
 
     def depth(self, index: int) -> NDArray[np.uint16]:
-        """[H, W] of the index-th frame, in units of `depth_scale_m`; 0 is no measurement."""
+        """Return the depth image [H, W] of frame `index`, in units of `depth_scale_m`. 0 is no measurement."""
         return read_depth(self.folder / "depth" / f"{self.frames[index]:06d}.png")
 
     def color(self, index: int) -> NDArray[np.uint8] | None:
-        """[H, W, 3] of the index-th frame, or None where no colour was recorded."""
+        """Return the colour image [H, W, 3] of frame `index`, or None if colour was not recorded."""
         path = self.folder / "color" / f"{self.frames[index]:06d}.png"
         return read_color(path) if path.is_file() else None
 
 
 @dataclass(frozen=True)
 class ScenePlacement:
-    """Where a scenario's scene lies in the robot's base frame: p_scene = Rz(yaw) (p_base - origin) / length_unit."""
+    """Pose and unit of a scene in the robot's base frame: p_scene = Rz(yaw) (p_base - origin) / length_unit."""
 
     origin_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """The scene's origin in the base frame."""
+    """Position of the scene's origin in the base frame."""
     yaw_rad: float = 0.0
     length_unit_m: float = 1.0
 
     def to_scene(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Base-frame points [..., 3] [m] in the scene's frame and length unit."""
+        """Transform base-frame points [..., 3] [m] to the scene's frame and length unit."""
         return (points - np.array(self.origin_m)) @ self.rotation.T / self.length_unit_m
 
     def to_world(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Scene points [..., 3] in the base frame [m]."""
+        """Transform scene points [..., 3] to the base frame [m]."""
         return self.length_unit_m * points @ self.rotation + np.array(self.origin_m)
 
     @property
     def rotation(self) -> NDArray[np.float64]:
-        """[3, 3] turns directions of the base frame into the scene's."""
+        """[3, 3] rotation from the base frame to the scene's frame."""
         c, s = np.cos(self.yaw_rad), np.sin(self.yaw_rad)
         return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
@@ -253,12 +255,13 @@ class RawEpisode:
 
     @property
     def placement(self) -> ScenePlacement:
-        """`scene_in_world` of episode.json; without it the scene's frame is the base frame."""
+        """Placement of the scene in the base frame, from episode.json. Without an entry both frames are the same."""
         return read_placement(self.description.get("scene_in_world") or {})
 
 
 def read_placement(fields: Mapping[str, Any]) -> ScenePlacement:
-    """
+    """Return the placement that the fields of `scene_in_world` describe.
+
     Raises:
         ValidationError: (pydantic's) the fields are not a valid placement.
     """
@@ -267,10 +270,10 @@ def read_placement(fields: Mapping[str, Any]) -> ScenePlacement:
 
 
 def read_raw_episode(folder: Path) -> RawEpisode:
-    """Open a raw episode; `diffcloud.sensing.validation` looks deeper.
+    """Open a raw episode. `diffcloud.sensing.validation` has further checks of the data.
 
     Raises:
-        EpisodeError: a file is missing or damaged, times run backwards, or there is no frame: names file and row.
+        EpisodeError: a file is missing or damaged, times do not increase, or a camera has no frame.
     """
     folder = Path(folder)
     description = read_description(folder)
@@ -287,10 +290,10 @@ def read_raw_episode(folder: Path) -> RawEpisode:
 
 
 def read_raw_camera(folder: Path, name: str) -> RawCamera:
-    """One camera of the raw episode in a folder; of one that is being recorded, with the frames so far, maybe none.
+    """Open one camera of a raw episode. During a recording, it has the frames written so far, possibly none.
 
     Raises:
-        EpisodeError: a file is missing or damaged, or times run backwards: names file and row.
+        EpisodeError: a file is missing or damaged, or times do not increase. The message names file and row.
     """
     place = folder / "cameras" / name
     frames, times = read_timestamps(place / "timestamps.csv", torn=True)
@@ -299,10 +302,10 @@ def read_raw_camera(folder: Path, name: str) -> RawCamera:
 
 
 def read_description(folder: Path) -> dict[str, Any]:
-    """episode.json.
+    """Read and validate episode.json.
 
     Raises:
-        EpisodeError: missing, damaged, of another schema version, without cameras, or not in SI.
+        EpisodeError: the file is missing or damaged, has another schema version, no camera, or other units than SI.
     """
     path = Path(folder) / "episode.json"
     data = read_json(path, error=EpisodeError)
@@ -327,13 +330,13 @@ def read_camera_info(path: Path) -> CameraInfo:
 
 
 def read_timestamps(path: Path, *, torn: bool = False) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """(frame numbers [T], times [T]) of timestamps.csv, in the order of the file.
+    """Return the frame numbers [T] and times [T] of timestamps.csv, in the order of the file.
 
     Args:
-        torn: as of `read_csv`: whether `RawEpisodeWriter` wrote it, which ends every row.
+        torn: ignore an incomplete last line, as a crash of `RawEpisodeWriter` leaves it.
 
     Raises:
-        EpisodeError: missing, or not the columns frame and t_s.
+        EpisodeError: the file is missing, or its columns are not frame and t_s.
     """
     table = _read_table(path, ("frame", "t_s"), torn=torn)
     frames = table["frame"].to_numpy(np.float64)
@@ -345,13 +348,13 @@ def read_timestamps(path: Path, *, torn: bool = False) -> tuple[NDArray[np.int64
 
 
 def read_robot_log(path: Path, *, torn: bool = False) -> RobotLog:
-    """robot.csv; columns other than t_s and the joints may be absent or empty.
+    """Read robot.csv. Columns other than t_s and the joints may be absent or empty.
 
     Args:
-        torn: as of `read_timestamps`.
+        torn: ignore an incomplete last line, as a crash of `RawEpisodeWriter` leaves it.
 
     Raises:
-        EpisodeError: missing, not numbers, or without t_s and joints.
+        EpisodeError: the file is missing, has no columns t_s and joint_1, or has invalid values.
     """
     table = _read_table(path, ("t_s", "joint_1"), torn=torn)
     count = 1
@@ -388,13 +391,13 @@ def read_robot_log(path: Path, *, torn: bool = False) -> RobotLog:
 
 
 def first_backwards(times: NDArray[np.float64]) -> int | None:
-    """Index of the first time that does not come after the one before it."""
+    """Return the index of the first time that is not later than its predecessor, or None."""
     bad = np.flatnonzero(~(np.diff(times) > 0))
     return int(bad[0]) + 1 if len(bad) else None
 
 
 def raw_episode_files(folder: Path) -> tuple[list[str], list[str]]:
-    """Relative paths of the files of a raw episode, and of others that lie in its folder; hidden ones are neither."""
+    """List the files of a raw episode, and all other files in its folder, without hidden ones (relative paths)."""
     paths = (path for path in Path(folder).rglob("*") if path.is_file())
     names = [path.relative_to(folder) for path in paths]
     seen = sorted(name.as_posix() for name in names if not any(part.startswith(".") for part in name.parts))
@@ -403,27 +406,27 @@ def raw_episode_files(folder: Path) -> tuple[list[str], list[str]]:
 
 
 def exists_already(folder: Path) -> EpisodeError:
-    """What is raised where a raw episode should be written to a folder that is there."""
+    """Return the error for an attempt to write a raw episode to a folder that already exists."""
     return EpisodeError(f"{folder} exists; raw episodes are never overwritten. Choose another name.")
 
 
 class RawEpisodeWriter:
-    """Writes a raw episode while it is recorded; a context manager.
+    """Write a raw episode during a recording; a context manager.
 
-    Each camera may be fed from a thread of its own; robot rows come from one thread.
+    Each camera may call `add_frame` from its own thread. Only one thread may add robot rows.
 
     Args:
-        folder: must not exist yet: raw episodes are never overwritten.
-        cameras: by name.
-        rate_hz: of the frames; None where it is not known.
-        robot: what the arm is (model, address); None without an arm.
-        joint_count: of robot.csv.
-        durable: wait for the disk now and after each frame, so that a power cut keeps it.
-        started_at: ISO 8601; by default now.
+        folder: folder to create. An existing folder is an error, since raw episodes are never overwritten.
+        cameras: camera name -> description.
+        rate_hz: frame rate, None if unknown.
+        robot: description of the arm (model, address), None without an arm.
+        joint_count: number of joints in robot.csv.
+        durable: fsync each frame, so that a power cut does not lose it.
+        started_at: start time in ISO 8601, by default now.
 
     Raises:
-        EpisodeError: the folder exists, or a name is no plain folder name.
-        OutputError: the system refused a write (a full disk); says how many frames are kept.
+        EpisodeError: the folder exists, or a name is not a plain folder name.
+        OutputError: the system refused a write (a full disk). The message has the number of complete frames.
     """
 
     def __init__(
@@ -473,20 +476,20 @@ class RawEpisodeWriter:
             self._robot = _Rows(self.folder / "robot.csv", ["t_s", *joints, "gripper", *_TOOL, *_WRENCH], durable=durable)
         self.robot_rows = 0
         write_json(self.folder / "episode.json", self._description)
-        if durable:  # no frame is read without these
+        if durable:  # readers need these files and folders even after a crash
             _sync(self.folder / "episode.json", self.folder, self.folder / "cameras", self.folder.parent)
 
     @property
     def frame_counts(self) -> dict[str, int]:
-        """Finished frames of each camera."""
+        """Number of complete frames of each camera."""
         return {name: files.count for name, files in self._cameras.items()}
 
     def add_frame(self, camera: str, t_s: float, depth: NDArray[np.uint16], color: NDArray[np.uint8] | None = None) -> None:
-        """Write one frame of one camera; it counts once this returns."""
+        """Write one frame of one camera. The frame is complete when this method returns."""
         self._cameras[camera].add(t_s, depth, color)
 
     def add_robot(self, *samples: RobotSample) -> None:
-        """Write rows of robot.csv; all of them together are waited for once."""
+        """Write rows of robot.csv, with at most one fsync for all of them."""
         if self._robot is None:
             raise EpisodeError("This episode was opened without a robot.")
         rows = []
@@ -504,11 +507,11 @@ class RawEpisodeWriter:
             self.robot_rows += len(rows)
 
     def state_rate(self, rate_hz: float | None) -> None:
-        """The rate of the frames, where it is known only at the end."""
+        """Set the frame rate afterwards, if it is known only at the end of the recording."""
         self._description["rate_hz"] = rate_hz
 
     def close(self, *, stop_reason: str | None = None) -> None:
-        """Finish: the status becomes complete, or stopped with a reason. Twice does no harm."""
+        """Finish with status `complete`, or `stopped` if a reason is given. Further calls have no effect."""
         if self._description["status"] != "recording":
             return
         for rows in (*(files.rows for files in self._cameras.values()), *([] if self._robot is None else [self._robot])):
@@ -527,12 +530,12 @@ class RawEpisodeWriter:
         try:
             self.close(stop_reason=reason)
         except DiffCloudError:
-            if error is None:  # a full disk has already been reported by the error that brought us here
+            if error is None:  # otherwise the error inside the block has already reported a full disk
                 raise
 
 
 class _CameraFiles:
-    """The files of one camera."""
+    """Image folders and timestamps.csv of one camera that is being recorded."""
 
     def __init__(self, folder: Path, info: CameraInfo, *, durable: bool) -> None:
         self._folder, self._durable = folder, durable
@@ -560,7 +563,7 @@ class _CameraFiles:
                 if color is not None:
                     _sync(self._folder / "color")
                 if self.count == 0:
-                    _sync(self._folder)  # where the folders of images are new
+                    _sync(self._folder)  # the image folders in it are new
             self.rows.append([self.count, t_s])
         except (OSError, DiffCloudError) as error:
             kept = f" The {self.count} frames before it are kept." if self._durable else ""
@@ -571,13 +574,13 @@ class _CameraFiles:
 
 
 class _Rows:
-    """A CSV that grows by whole, flushed lines."""
+    """A CSV file to which complete lines are appended without buffering."""
 
     def __init__(self, path: Path, columns: Sequence[str], *, durable: bool) -> None:
         self._durable, self._path = durable, path
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            # unbuffered: what a full disk refuses must not come back when the file is closed
+            # Unbuffered, so that closing the file does not retry a write that a full disk refused.
             self._stream = path.open("xb", buffering=0)
         except OSError as error:
             raise OutputError(f"Cannot write {path}: {error.strerror}.") from error
@@ -601,7 +604,7 @@ class _Rows:
 
 
 def _sync(*paths: Path) -> None:
-    """Wait until files and folders are on the disk."""
+    """Flush files and folders to the disk (fsync)."""
     for path in paths:
         try:
             handle = os.open(path, os.O_RDONLY)

@@ -1,4 +1,4 @@
-"""What every import of a recording comes down to: cameras, frames as they come, a joint log; and their way to disk."""
+"""The common form of imported recordings (cameras, frames, joint log), and writing it as a raw episode."""
 
 from __future__ import annotations
 
@@ -25,16 +25,16 @@ from diffcloud.io.raw_episodes import (
 )
 
 EPOCH_S = 1e8
-"""Times beyond three years are seconds since 1970."""
+"""Times above this value [s] (three years) are taken as seconds since 1970."""
 
 
 @dataclass(frozen=True)
 class RecordedFrame:
-    """One pair of images of one camera."""
+    """A depth image and optional colour image of one camera."""
 
     camera: str
     time_s: float
-    """Of the recording's clock."""
+    """Time on the recording's clock."""
     depth: NDArray[np.uint16]
     """[H, W] in units of the camera's depth scale."""
     color: NDArray[np.uint8] | None = None
@@ -43,31 +43,31 @@ class RecordedFrame:
 
 @dataclass(frozen=True)
 class Recording:
-    """A recording of another tool, ready to be written as a raw episode."""
+    """A recording of another tool, in a form that `write_recording` can write as a raw episode."""
 
     cameras: Mapping[str, CameraInfo]
     frames: Iterable[RecordedFrame]
-    """In order of time for each camera; may be read only once."""
+    """Frames in order of time for each camera. The iterable may be consumed only once."""
     source: str
     robot: RobotLog | None = None
-    """On the frames' clock."""
+    """Joint log on the clock of the frames."""
     warnings: tuple[str, ...] = ()
-    """What was left out, guessed or put right, for the person who imports."""
+    """Messages to the user about data that were omitted, guessed or corrected."""
 
 
 def write_recording(
     folder: Path, recording: Recording, *, rate_hz: float | None = None, meta: Mapping[str, Any] | None = None
 ) -> dict[str, int]:
-    """Write a raw episode; times start at the first frame.
+    """Write a recording as a raw episode. Times start at the first frame.
 
     Args:
-        rate_hz: stated in episode.json; None measures the first camera's.
+        rate_hz: frame rate for episode.json. None: measure it from the first camera.
 
     Returns:
-        Frames by camera.
+        Number of frames of each camera.
 
     Raises:
-        EpisodeError: no frame at all, one that does not come after the camera's frame before it, or a rate that is none.
+        EpisodeError: there is no frame, times of a camera do not increase, or the rate is invalid.
     """
     check_frame_rate(rate_hz)
     frames = _read(recording)
@@ -82,10 +82,10 @@ def write_recording(
 
 
 def _read(recording: Recording) -> Iterator[RecordedFrame]:
-    """Its frames.
+    """Yield the frames of a recording.
 
     Raises:
-        EpisodeError: the system cannot read one.
+        EpisodeError: the system cannot read a frame.
     """
     try:
         yield from recording.frames
@@ -94,9 +94,10 @@ def _read(recording: Recording) -> Iterator[RecordedFrame]:
 
 
 def check_frame_rate(rate_hz: float | None) -> None:
-    """
+    """Check a frame rate. None (unknown) is valid.
+
     Raises:
-        EpisodeError: no camera has it.
+        EpisodeError: the rate is not positive, or higher than any camera's.
     """
     if rate_hz is not None and not 0 < rate_hz <= MOST_HZ:
         raise EpisodeError(
@@ -113,7 +114,7 @@ def _written(
     rate_hz: float | None,
     meta: Mapping[str, Any] | None,
 ) -> dict[str, int]:
-    """The episode in this folder; frames by camera."""
+    """Write the episode into a folder and return the number of frames of each camera."""
     robot = recording.robot
     joint_count = 7 if robot is None else robot.joints_rad.shape[1]
     writer = RawEpisodeWriter(
@@ -149,15 +150,15 @@ def _written(
 
 
 def read_joint_log(path: Path, *, offset_s: float = 0.0, recording_start_s: float = 0.0) -> RobotLog:
-    """A joint log in the columns of robot.csv, on the recording's clock.
+    """Read a joint log with the columns of robot.csv, and convert its times to the recording's clock.
 
     Args:
-        offset_s: is added to its times.
-        recording_start_s: of the first frame. Where it is seconds since 1970 and the log's times are not, the log is taken
-            to count from the first frame; else both are on one clock.
+        offset_s: added to the times of the log.
+        recording_start_s: time of the first frame. If only this time is in seconds since 1970, times of the log are assumed
+            to count from the first frame. Otherwise both are assumed to have the same clock.
 
     Raises:
-        EpisodeError: missing, damaged, with times that run backwards, or on another clock than the recording.
+        EpisodeError: the log is missing or damaged, its times do not increase, or its clock is another one.
     """
     log = read_robot_log(path)
     if not len(log.times):
@@ -169,7 +170,7 @@ def read_joint_log(path: Path, *, offset_s: float = 0.0, recording_start_s: floa
             "the clock was set while recording, or rows were mixed up. Sort or cut the log."
         )
     times = log.times + offset_s
-    if times[0] < EPOCH_S <= recording_start_s:  # a clock of its own
+    if times[0] < EPOCH_S <= recording_start_s:  # the log counts from the first frame
         times = times + recording_start_s
     if recording_start_s > times[-1] or (times[0] >= EPOCH_S > recording_start_s):
         raise EpisodeError(

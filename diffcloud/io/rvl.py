@@ -1,8 +1,8 @@
-"""RVL, a lossless code for depth images (Wilson 2017, "Fast lossless depth image compression").
+"""Decode RVL, a lossless compression of depth images (Wilson 2017, "Fast lossless depth image compression").
 
-Runs of pixels without a measurement alternate with runs of measured ones. Each measured pixel is stored as its difference
-from the one before, with the sign in the lowest bit. All numbers are written in groups of three bits, the lowest first,
-each with a fourth bit that says whether another group follows; eight such groups fill a 32-bit word from the top.
+Runs of pixels without a measurement alternate with runs of measured pixels. A measured pixel is stored as the
+difference to the previous one, with the sign in the lowest bit. Numbers are stored in groups of three bits, lowest
+first. A fourth bit of each group is set if another group follows. Eight groups fill a 32-bit word from the top.
 """
 
 from __future__ import annotations
@@ -14,18 +14,18 @@ from diffcloud.errors import EpisodeError
 
 _LARGEST_PIXELS = 64_000_000
 _MOST_GROUPS = 10
-"""Of one number: thirty bits."""
+"""Largest number of groups of one number (30 bits)."""
 
 
 def decode_rvl(data: bytes, name: str) -> NDArray[np.uint16]:
-    """Depth [H, W].
+    """Decode a depth image [H, W].
 
     Args:
-        data: width and height as 32-bit integers, then the code, as ROS sends it.
-        name: of the image, for messages.
+        data: width and height as 32-bit integers, then the RVL code, as in ROS messages.
+        name: name of the image, for messages.
 
     Raises:
-        EpisodeError: damaged.
+        EpisodeError: the data are damaged.
     """
     if len(data) < 8:
         raise EpisodeError(f"An RVL image of {name} has {len(data)} bytes; the recording is damaged.")
@@ -36,7 +36,7 @@ def decode_rvl(data: bytes, name: str) -> NDArray[np.uint16]:
     pixels = np.zeros(width * height, np.uint16)
     measured, coded = [], []
     place = read = 0
-    while place < len(pixels) and read + 1 < len(numbers):  # one step for each run, of which an image has few
+    while place < len(pixels) and read + 1 < len(numbers):  # one iteration per run; images have few runs
         place += int(numbers[read])
         count = int(numbers[read + 1])
         if place + count > len(pixels) or read + 2 + count > len(numbers):
@@ -56,7 +56,7 @@ def decode_rvl(data: bytes, name: str) -> NDArray[np.uint16]:
 
 
 def _numbers(code: bytes) -> NDArray[np.int64]:
-    """All numbers of a code; the padding of the last word gives zeros."""
+    """Return all numbers of a code. Padding in the last word gives zeros."""
     words = np.frombuffer(code[: len(code) // 4 * 4], "<u4")
     groups = ((words[:, None] >> np.arange(28, -1, -4, dtype=np.uint32)) & 0xF).ravel().astype(np.int64)
     last = np.flatnonzero(groups < 8)
@@ -64,6 +64,6 @@ def _numbers(code: bytes) -> NDArray[np.int64]:
         return np.zeros(0, np.int64)
     first = np.concatenate([[0], last[:-1] + 1])
     order = np.arange(last[-1] + 1) - np.repeat(first, last - first + 1)
-    # numbers of too many groups are damage; their high bits fall away, and what follows does not fit
+    # Too many groups are a sign of damage. Their high bits are dropped, so the image then has the wrong size.
     parts = np.where(order < _MOST_GROUPS, (groups[: last[-1] + 1] & 7) << (3 * np.minimum(order, _MOST_GROUPS)), 0)
     return np.add.reduceat(parts, first)

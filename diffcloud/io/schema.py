@@ -1,4 +1,4 @@
-"""What the models of all files share (pydantic): every field known, every number finite, and errors that name both."""
+"""Common types of the pydantic schemas of all files: unknown fields and non-finite numbers are errors."""
 
 from __future__ import annotations
 
@@ -12,22 +12,22 @@ from diffcloud.errors import DiffCloudError
 from diffcloud.io.numbers import CORE, PLAIN
 
 _MOST_FAULTS = 10
-"""That a message lists."""
+"""Largest number of errors in a message."""
 _MOST = 1e11
-"""More than any quantity of a cloth in SI units is; beyond it arithmetic overflows."""
+"""Largest accepted quantity in SI units. Larger values would overflow in the simulation."""
 _FARTHEST = 1e6
 Component = Annotated[float, Field(ge=-_FARTHEST, le=_FARTHEST)]
 Vector = tuple[Component, Component, Component]
 Positive = Annotated[float, Field(gt=0, le=_MOST)]
 NonNegative = Annotated[float, Field(ge=0, le=_MOST)]
 Friction = Annotated[float, Field(ge=0, le=100)]
-"""A Coulomb coefficient [-]."""
+"""Coulomb friction coefficient [-]."""
 FileName = Annotated[str, Field(max_length=250)]
-"""Longer ones no file system has."""
+"""No file system allows longer names."""
 
 
 def _plain(schema: Any) -> Any:
-    """A schema of pydantic whose numbers and truth values are plain."""
+    """Return a pydantic core schema with strict parsing of numbers and booleans (`_number`, `_truth`)."""
     if isinstance(schema, list | tuple):
         return type(schema)(map(_plain, schema))
     if not isinstance(schema, dict):
@@ -54,7 +54,7 @@ def _truth(value: object) -> object:
 
 
 class Plain(BaseModel):
-    """A block of a file whose numbers are plain decimals, also in quotes; a truth value is no number, nor the reverse."""
+    """Base of schemas in which numbers are plain decimals (quotes are allowed), and booleans are not numbers."""
 
     model_config = ConfigDict(allow_inf_nan=False)
 
@@ -64,13 +64,13 @@ class Plain(BaseModel):
 
 
 class Checked(Plain):
-    """A block of a file: frozen, every field known."""
+    """Base of immutable schemas without unknown fields."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
 
 def explain(source: object, error: ValidationError, kind: type[DiffCloudError]) -> DiffCloudError:
-    """A validation error in one message: each field with its path, what came, and what is allowed."""
+    """Convert a validation error to one message with path, value and rule for each invalid field."""
     faults = []
     for fault in error.errors()[:_MOST_FAULTS]:
         place = ".".join(str(part) for part in fault["loc"]) or "(the whole)"

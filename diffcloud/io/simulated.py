@@ -1,10 +1,10 @@
-"""Simulated sets: drawn parameters and the node trajectories that the simulator gives for them.
+"""Simulated data sets: sampled parameters and the node trajectories that the simulator returns for them.
 
-A folder holds, for each split (`train`, `test`), `<split>.csv` (one row per run: the parameters) and `<split>_nodes.npy`
-(float32 [N, T+1, V, 3]), and for both `set.json` (scenario, parameters and bounds, frames, how it was drawn), `surface.npz`
-(faces, times, the obstacle that is seen) and `replaced.csv` (draws whose simulation diverged, and why); on demand also
-`clouds/<split>/<run>/<frame>.npy`. No pickles. All in the frame and length unit of the scenario's scene. Otherwise clouds
-are sampled when they are needed (`clouds.augmentation`).
+A folder has for each split (`train`, `test`) `<split>.csv` (parameters, one row per run) and `<split>_nodes.npy`
+(float32 [N, T+1, V, 3]). Both splits share `set.json` (scenario, parameters, bounds, frames, sampling), `surface.npz`
+(faces, times, the visible obstacle) and `replaced.csv` (samples whose simulation diverged, with the reason).
+`clouds/<split>/<run>/ <frame>.npy` is optional; without it, clouds are sampled on demand (`clouds.augmentation`). No
+file has pickles. All positions are in the frame and length unit of the scene.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ Split = Literal["train", "test"]
 SPLITS: tuple[Split, ...] = get_args(Split)
 SCHEMA = 1
 LARGEST_BYTES = 16 * 2**30
-"""Of node trajectories in one file."""
+"""Largest size of a file of node trajectories."""
 _LATEST_S = 1e6
 _DAMAGE = (ValueError, OSError, KeyError, TypeError)
 
@@ -42,7 +42,7 @@ Count = Annotated[int, Field(ge=0, le=10_000_000)]
 
 
 class SetParameter(Plain):
-    """A parameter of set.json."""
+    """Schema of a parameter in set.json."""
 
     name: Name
     low: Component
@@ -50,7 +50,7 @@ class SetParameter(Plain):
 
 
 class SetFile(Plain):
-    """set.json, beside what says how the set was made."""
+    """Schema of set.json. Further keys describe how the set was made."""
 
     model_config = ConfigDict(extra="allow")
 
@@ -65,44 +65,44 @@ class SetFile(Plain):
     draws: Name | None = None
     seed: Annotated[int, Field(ge=0)] | None = None
     uncertain: dict[Name, Component] = Field(default_factory=dict)
-    """Other material that differs from run to run -> factor of one deviation."""
+    """Nuisance material parameter -> standard deviation as a factor. These values also vary between runs."""
     integrator: Name | None = None
     replaced: Count = 0
     clouds: Count = 0
-    """Points of a frame's cloud, where clouds were written; 0: none were."""
+    """Number of points of each cloud on disk, 0 if none were written."""
 
 
 @dataclass(frozen=True)
 class SimulatedSet:
-    """One split of a simulated set: N runs of V nodes over T steps of a frame.
+    """One split of a simulated set: N runs of V nodes over T frame intervals, with k sampled parameters.
 
     Raises:
-        DatasetError: shapes that do not fit together, values that are not finite, a frame that does not exist.
+        DatasetError: inconsistent shapes, values that are not finite, or a frame that does not exist.
     """
 
     scenario: str
     names: tuple[str, ...]
-    """Of the k drawn parameters."""
+    """[k] parameter names."""
     bounds: NDArray[np.float64]
-    """[k, 2] lowest and highest value of each."""
+    """[k, 2] lower and upper bound of each parameter."""
     parameters: NDArray[np.float64]
     """[N, k]"""
     nodes: NDArray[np.float32]
-    """[N, T+1, V, 3] positions at each frame, the start first."""
+    """[N, T+1, V, 3] node positions at each frame, starting with the initial state."""
     times: NDArray[np.float64]
     """[T+1] since the start [s]."""
     faces: NDArray[np.int64]
     """[F, 3] node indices."""
     loss_faces: NDArray[np.int64] | None
-    """Faces whose surface the scenario's loss samples (the upper half of the fold); None for all."""
+    """Faces from which the scenario's loss samples points (the upper half of the fold). None: all faces."""
     loss_frame: int
-    """Index into the T+1 frames that the scenario's loss looks at."""
+    """Index (0 to T) of the frame at which the scenario's loss is evaluated."""
     first_frame: int
-    """Index of the frame that a recorded episode begins with."""
+    """Index of the first frame of a recorded episode."""
     obstacle: SurfaceMesh | None
-    """The body seen beside the cloth (the pole, the hook); None where there is only a table."""
+    """The body that is visible beside the cloth (pole, hook). None if there is only a table."""
     length_unit_m: float
-    """Of one length unit of the scene [m]."""
+    """Length of one unit of the scene [m]."""
 
     def __post_init__(self) -> None:
         count, frames, nodes = self.nodes.shape[:3] if self.nodes.ndim == 4 else (0, 0, 0)
@@ -141,7 +141,7 @@ class SimulatedSet:
         """Read and check one split.
 
         Raises:
-            DatasetError: missing, damaged, or wrong inside; names the file and what was expected.
+            DatasetError: a file is missing, damaged or inconsistent.
         """
         folder = Path(folder)
         if split not in SPLITS:
@@ -177,12 +177,12 @@ class SimulatedSet:
 def write_simulated(
     folder: Path, sets: Mapping[Split, SimulatedSet], *, about: Mapping[str, Any], replaced: str
 ) -> list[str]:
-    """Write all files of a set into a folder, and return their names; the same set gives the same bytes.
+    """Write all files of a set into a folder and return their names. The same set always gives the same bytes.
 
     Args:
-        sets: the splits that have runs; they share everything but parameters and nodes.
-        about: what else `set.json` says (how the parameters were drawn).
-        replaced: the table of diverged draws, as CSV.
+        sets: the splits that have runs. They share everything except parameters and nodes.
+        about: further entries of `set.json`, such as how the parameters were sampled.
+        replaced: the table of diverged samples, as CSV.
     """
     folder = Path(folder)
     first = next(iter(sets.values()))
@@ -219,7 +219,7 @@ def write_simulated(
 
 
 def simulated_files(folder: Path) -> list[str]:
-    """Files of the set that a folder holds: what a new set may take the place of. None of any other folder."""
+    """List the files of the simulated set in a folder, which a new set may overwrite. Empty for any other folder."""
     folder = Path(folder)
     try:
         about = _about(folder / "set.json")
@@ -241,7 +241,7 @@ def _about(path: Path) -> dict[str, Any]:
         told = SetFile.model_validate(about)
     except ValidationError as error:
         raise explain(f"{path} is no simulated set", error, DatasetError) from error
-    return told.model_dump(mode="json", exclude_unset=True, by_alias=True)  # numbers even where the file has text
+    return told.model_dump(mode="json", exclude_unset=True, by_alias=True)  # numeric strings became numbers
 
 
 def _surface(path: Path) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""CSV files from others."""
+"""Read CSV files of the user."""
 
 from __future__ import annotations
 
@@ -18,23 +18,23 @@ from diffcloud.io.inputs import read_text
 from diffcloud.io.numbers import PLAIN, disguised
 
 _MOST_BYTES = 200_000_000
-"""Of a file: a joint log of an hour at a kilohertz has as many."""
+"""Largest file [bytes], about a joint log of one hour at 1 kHz."""
 _LONGEST_CELL = 10_000
 
 
 def read_csv(
     path: Path, *, kind: str, error: type[DiffCloudError], text: Sequence[str] = (), torn: bool = False
 ) -> pd.DataFrame:
-    """A table, as pandas reads it; numbers are plain decimals.
+    """Read a CSV file as a pandas table. Numbers must be plain decimals.
 
     Args:
-        kind: what it is, for messages: "gripper file".
-        text: columns that are not read as numbers, whatever is in them.
-        torn: whether the last line may have been cut off by a power cut; it is left out.
+        kind: kind of file, for messages, such as "gripper file".
+        text: columns that are read as text.
+        torn: ignore an incomplete last line, as a power cut may leave it.
 
     Raises:
-        error: missing, no regular file, too large, no UTF-8, without a line of names, with a name twice, with rows of
-            different length, or with what some would read as a number (`1_000`).
+        error: the file is missing, not a regular file, too large, not UTF-8, or has no header. Also if a column name
+            occurs twice, rows differ in length, or a cell has an ambiguous number (`1_000`).
     """
     path = Path(path)
     content = read_text(path, kind=kind, error=error, most_bytes=_MOST_BYTES)
@@ -45,7 +45,7 @@ def read_csv(
         twice = [name for name, count in Counter(names).items() if count > 1]
         if twice:
             raise ValueError(f"it has the column {twice[0]!r} twice")
-        with warnings.catch_warnings():  # of rows that are longer than the line of names, whose end pandas would drop
+        with warnings.catch_warnings():  # pandas only warns when it truncates rows that are longer than the header
             warnings.simplefilter("error", pd.errors.ParserWarning)
             kinds = dict.fromkeys(text, str)
             table = pd.read_csv(io.StringIO(content), skipinitialspace=True, dtype=kinds, index_col=False)
@@ -57,7 +57,7 @@ def read_csv(
             if name not in text and (wrong := next((cell for cell in words[name] if _disguised(cell)), None)):
                 raise ValueError(f"column {name!r} has {wrong!r}, which is no number; allowed are {PLAIN}")
         return table
-    except (ValueError, csv.Error, pd.errors.ParserWarning) as damage:  # pandas' own errors are values'
+    except (ValueError, csv.Error, pd.errors.ParserWarning) as damage:  # pandas' own errors are ValueErrors
         raise error(f"{path} is not a readable {kind}: {damage}.") from damage
 
 
@@ -66,13 +66,13 @@ def _disguised(cell: object) -> bool:
 
 
 def numbers(table: pd.DataFrame, columns: Sequence[str], *, place: str, error: type[DiffCloudError]) -> NDArray[np.float64]:
-    """[rows, columns] of a table; an empty cell is NaN.
+    """Return columns of a table as an array [rows, columns]. An empty cell is NaN.
 
     Args:
-        place: of the table, for messages.
+        place: name of the table, for messages.
 
     Raises:
-        error: a column is missing, or has cells that are no plain numbers, such as `1:30` or `True`.
+        error: a column is missing, or has cells that are not plain numbers, such as `1:30` or `True`.
     """
     missing = [name for name in columns if name not in table.columns]
     if missing:

@@ -1,6 +1,6 @@
-"""How long a result took, and with which versions: beside it, in a hidden file that DVC ignores.
+"""Wall time and package versions of a result, in a hidden file beside it that DVC ignores.
 
-A result has the same bytes whenever and wherever it is made; this has not, and it may be missing.
+Results are byte-identical between runs. Timings are not, so they are kept in a separate file, which may be missing.
 """
 
 from __future__ import annotations
@@ -17,24 +17,24 @@ from diffcloud.io.files import read_json, write_json
 
 AnyPath = TypeVar("AnyPath", bound=PurePath)
 NAME = ".{}.timings.json"
-"""Of the file beside a result; `.dvcignore` has it too."""
+"""Name of the file beside a result. `.dvcignore` has the same pattern."""
 _FILES = (".json", ".safetensors")
-"""Suffixes of results that are files; others are folders, whose names may have a dot."""
+"""Suffixes of results that are files. Other results are folders, whose names may have a dot."""
 
 
 def timings_path(result: AnyPath) -> AnyPath:
-    """The file that belongs to a result, a file or a folder."""
+    """Return the path of the timings of a result (file or folder)."""
     return result.with_name(NAME.format(result.stem if result.suffix in _FILES else result.name))
 
 
 def write_timings(result: Path, seconds: float, **more: Any) -> None:
-    """State the wall time of a result [s]; with the versions that it was made with, and `more`."""
+    """Write the wall time of a result [s], the package versions, and further entries `more`."""
     versions = {"diffcloud": diffcloud.__version__, "torch": torch.__version__, "python": platform.python_version()}
     write_json(timings_path(result), {"seconds": seconds, **more, "versions": versions})
 
 
 def read_timings(result: Path) -> dict[str, Any]:
-    """What is known; empty where nothing is, since a result does not depend on it."""
+    """Read the timings of a result. Empty if they are missing or damaged, because no result depends on them."""
     try:
         told = read_json(timings_path(result))
     except DiffCloudError:
@@ -43,7 +43,7 @@ def read_timings(result: Path) -> dict[str, Any]:
 
 
 def read_seconds(result: Path) -> float | None:
-    """Wall time of a result [s]; None where it is not known."""
+    """Return the wall time of a result [s], or None if unknown."""
     seconds = read_timings(result).get("seconds")
     if isinstance(seconds, bool) or not isinstance(seconds, int | float) or not seconds >= 0:
         return None

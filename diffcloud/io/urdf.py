@@ -1,8 +1,9 @@
-"""Robot descriptions (URDF): the tree of joints, and the surface of each link in its own frame.
+"""Read robot descriptions (URDF): the tree of joints, and the surface mesh of each link in its own frame.
 
-A URDF is a file of others: XML without document types or entities, of bounded size; meshes only from the folder it lies in.
-`package://name/path` is looked for as `name/path` and as `path` in that folder, so that no ROS workspace is needed. COLLADA
-meshes are read as ROS reads them: the stated unit counts, the stated up axis does not.
+URDF files may come from untrusted sources. XML with document types or entities is refused, sizes are limited, and
+meshes are read only from the URDF's folder. `package://name/path` is searched as `name/path` and as `path` in that
+folder, so no ROS workspace is needed. As in ROS, the length unit in a COLLADA mesh is applied and its up axis is
+ignored.
 """
 
 from __future__ import annotations
@@ -30,15 +31,15 @@ _LARGEST_XML = 16 * 2**20
 _LARGEST_MESH = 64 * 2**20
 _MESH_FORMATS = (".dae", ".obj", ".ply", ".stl")
 _LARGEST_M = 10.0
-"""No link is larger: one that is has its meshes in millimetres."""
+"""Largest extent of a link. A larger mesh is probably in millimetres."""
 _LARGEST = 1000.0
-"""[m or rad] Of any number that is used."""
+"""Largest accepted number in a URDF [m or rad]."""
 _ONCE = ("origin", "geometry", "axis", "limit", "mimic", "parent", "child")
 
 
 @dataclass(frozen=True)
 class Mimic:
-    """A joint that follows another: angle = multiplier · angle of `joint` + offset."""
+    """Coupling to another joint: angle = multiplier · angle of `joint` + offset."""
 
     joint: str
     multiplier: float
@@ -47,25 +48,25 @@ class Mimic:
 
 @dataclass(frozen=True)
 class Joint:
-    """How a child link hangs on its parent."""
+    """A joint between a parent and a child link."""
 
     name: str
     kind: JointKind
     parent: str
     child: str
     T_parent_joint: Floats
-    """[4, 4] at angle 0 [m]."""
+    """[4, 4] transform from the joint's frame to the parent's at angle 0 [m]."""
     axis: Floats
     """[3] unit vector in the joint's frame."""
     lower: float
     upper: float
-    """Limits [rad or m]; infinite where none are stated."""
+    """Limits [rad or m]. Infinite if the URDF does not have them."""
     mimic: Mimic | None = None
 
 
 @dataclass(frozen=True)
 class LinkMesh:
-    """A link's surface in the link's frame; triangles need not be closed."""
+    """A link's surface in the link's frame. The mesh need not be closed."""
 
     vertices: Floats
     """[V, 3] [m]."""
@@ -80,17 +81,17 @@ class RobotDescription:
     name: str
     root: str
     joints: tuple[Joint, ...]
-    """From the root outwards: a joint comes after the one that carries its parent."""
+    """Ordered from the root: each joint comes after the joint that moves its parent."""
     meshes: Mapping[str, LinkMesh]
-    """By link; links without geometry are absent."""
+    """Link name -> mesh. Links without geometry are absent."""
 
 
 def read_urdf(path: Path) -> RobotDescription:
-    """Read a URDF and the meshes it names (visual geometry; collision geometry where a link has no visual one).
+    """Read a URDF and its meshes: the visual geometry, or the collision geometry of links without a visual one.
 
     Raises:
-        RobotError: missing or damaged, a mesh that is missing or outside the URDF's folder, an unknown joint type or
-            shape, or links that form no tree; names the element.
+        RobotError: a file is missing or damaged, or a mesh is outside the URDF's folder. Also if a joint type or shape
+            is unknown, or the links do not form a tree. The message names the element.
     """
     path = Path(path)
     root = _xml(path)
@@ -122,7 +123,7 @@ def _xml(path: Path) -> ElementTree.Element:
     text = read_input(path, kind="robot description", error=RobotError, most_bytes=_LARGEST_XML)
     _refuse_entities(text, path)
     builder = ElementTree.TreeBuilder()
-    # not ElementTree's own parser: robots carry prefixes that nothing declares (drake:, gazebo:), and ROS reads them
+    # Many robots use undeclared XML prefixes (drake:, gazebo:). ROS accepts them, ElementTree's own parser does not.
     parser = expat.ParserCreate("utf-8")
     parser.StartElementHandler, parser.EndElementHandler = builder.start, builder.end
     parser.CharacterDataHandler = builder.data
@@ -134,7 +135,7 @@ def _xml(path: Path) -> ElementTree.Element:
 
 
 def _refuse_entities(text: bytes, path: Path) -> None:
-    """Entities can grow without bound and can name files of the system; no robot needs them."""
+    """Refuse document types and entities, which can expand without bound or read system files. No robot needs them."""
     if b"<!DOCTYPE" in text or b"<!ENTITY" in text or b"\0" in text:
         raise RobotError(
             f"{path} declares a document type or entities, or is not UTF-8; such XML is not read. Remove them."
@@ -174,7 +175,7 @@ def _joint(element: ElementTree.Element, path: Path) -> Joint:
 
 
 def _tree(links: list[str], joints: list[Joint], path: Path) -> tuple[str, tuple[Joint, ...]]:
-    """The root, and the joints from it outwards."""
+    """Return the root link, and the joints ordered from the root outwards."""
     names = [joint.name for joint in joints]
     carried = [joint.child for joint in joints]
     for joint in joints:
@@ -203,7 +204,7 @@ def _tree(links: list[str], joints: list[Joint], path: Path) -> tuple[str, tuple
 
 
 def _shape(element: ElementTree.Element, path: Path, loaded: dict[Path, LinkMesh]) -> LinkMesh:
-    """One <visual> or <collision> in the link's frame."""
+    """Read a <visual> or <collision> element as a mesh in the link's frame."""
     import trimesh
 
     where = f"{path}: <{element.tag}>"
@@ -260,7 +261,7 @@ def _read_mesh(path: Path) -> LinkMesh:
         mesh = _read_collada(data, path) if suffix == ".dae" else _read_triangles(data, suffix)
     except RobotError:
         raise
-    except Exception as error:  # the readers raise many kinds on damaged files
+    except Exception as error:  # mesh readers raise many types of errors on damaged files
         raise RobotError(f"{path} is not a readable mesh: {error}.") from error
     if not len(mesh.faces) or not np.isfinite(mesh.vertices).all():
         raise RobotError(f"{path} holds no triangle, or coordinates that are not finite.")
@@ -270,7 +271,7 @@ def _read_mesh(path: Path) -> LinkMesh:
 def _read_triangles(data: bytes, suffix: str) -> LinkMesh:
     import trimesh
 
-    # no resolver: materials and textures that the file names stay unread
+    # Without a resolver, trimesh opens no materials or textures that the file names.
     return _of(trimesh.load(io.BytesIO(data), file_type=suffix[1:], force="mesh", process=False))
 
 
@@ -297,7 +298,7 @@ def _of(mesh: Any) -> LinkMesh:
 
 
 def joined(shapes: list[LinkMesh]) -> LinkMesh:
-    """All of them as one mesh."""
+    """Concatenate meshes."""
     starts = np.cumsum([0, *(len(shape.vertices) for shape in shapes)])
     return LinkMesh(
         np.concatenate([shape.vertices for shape in shapes]),
@@ -336,7 +337,7 @@ def _sizes(element: ElementTree.Element, key: str, where: str, *, count: int = 1
 
 
 def _refuse_doubles(root: ElementTree.Element, path: Path) -> None:
-    """Of two, one would be taken in silence."""
+    """Refuse duplicate elements, of which a parser would silently use only one."""
     for element in root.iter():
         for tag in _ONCE:
             if len(element.findall(tag)) > 1:
@@ -353,6 +354,6 @@ def _text(element: ElementTree.Element, key: str, path: Path) -> str:
 
 
 def link_names(description: RobotDescription) -> Iterator[str]:
-    """The root, then the child of each joint."""
+    """Yield the root link, then the child link of each joint."""
     yield description.root
     yield from (joint.child for joint in description.joints)

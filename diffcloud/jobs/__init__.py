@@ -1,4 +1,4 @@
-"""Long work with files: many jobs in several processes, what is finished kept, progress told, Ctrl-C answered.
+"""Long-running work on files: parallel jobs that keep finished results, show progress, and handle Ctrl-C.
 
-Commands and stages of the pipeline run what lies here; each parses its options, calls one function, and prints or writes.
+CLI commands and pipeline stages parse options, call one of these functions, and print or write its result.
 """

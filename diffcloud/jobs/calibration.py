@@ -1,4 +1,4 @@
-"""Calibration of all cameras of a set-up, by images of a board or by points of a checkerboard."""
+"""Calibrate all cameras of a setup from images of a ChArUco board, or from points touched by the robot."""
 
 from __future__ import annotations
 
@@ -24,24 +24,24 @@ from diffcloud.sensing.pictures import reprojection_picture
 
 @dataclass(frozen=True)
 class Calibrated:
-    """A calibration and what is said about it."""
+    """A calibration with its summary and warnings."""
 
     calibration: Calibration
     summary: dict[str, dict[str, Any]]
-    """By camera: figures and T_world_camera."""
+    """Camera name -> residuals and T_world_camera."""
     warnings: list[str]
     more: dict[str, Any] = field(default_factory=dict)
-    """Figures of the whole."""
+    """Results that do not belong to one camera."""
 
 
 def by_charuco(episode: RawEpisode, board: CharucoBoard, picture: Path | None) -> Calibrated:
-    """From images of a board in the gripper.
+    """Calibrate cameras from images of a ChArUco board in the gripper.
 
     Args:
-        picture: PNG of detected and reprojected corners, if wanted.
+        picture: path of a PNG with detected and reprojected corners, if wanted.
 
     Raises:
-        CalibrationError: no joint log, too few views, or none that agree.
+        CalibrationError: there is no joint log, too few views, or views contradict each other.
     """
     if episode.robot is None:
         raise CalibrationError(f"{episode.folder} has no robot.csv: the board's place comes from the gripper's pose.")

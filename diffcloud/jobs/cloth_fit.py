@@ -1,4 +1,4 @@
-"""A fit of one cloth with its files: OUT/fit.json, fit.npz, intervals.json, report.html, and scenes/."""
+"""Fit one cloth and write fit.json, fit.npz, intervals.json, report.html and scenes/ to the output folder."""
 
 from __future__ import annotations
 
@@ -30,39 +30,39 @@ from diffcloud.sim import warm
 
 @dataclass(frozen=True)
 class ClothFit:
-    """What is fitted, and where it is written."""
+    """Recordings, settings and output folder of a fit."""
 
     members: Sequence[Recording]
     settings: FitSettings
     out: Path
     scenes: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
-    """Scenario -> its fields, of those that later commands can find beside the fit only."""
+    """Scenario name -> fields of its YAML file, for scenarios that later commands can find only beside the fit."""
     init: Mapping[str, float] = field(default_factory=dict)
-    """Values of the first start."""
+    """Parameter values of the first start."""
 
     @property
     def job(self) -> FitJob:
         return FitJob("fit", self.members, self.settings, self.out / "stages", self.init)
 
     def run(self, seconds: float | None) -> tuple[Told, list[str]]:
-        """Fit and write. At Ctrl-C or the end of the time, the best so far is written.
+        """Fit and write the results. After Ctrl-C or the time limit, the best fit so far is written.
 
         Args:
-            seconds: for the fit; None: as long as it takes.
+            seconds: time limit of the fit. None: no limit.
 
         Returns:
-            What there is to tell, and its findings in sentences.
+            The results, and the findings about them in sentences.
 
         Raises:
-            DiffCloudError: the time was over before a first loss was known.
-            KeyboardInterrupt: Ctrl-C before a first loss beside an earlier fit, or once more.
+            DiffCloudError: the time limit was reached before the first loss evaluation.
+            KeyboardInterrupt: Ctrl-C twice, or before the first loss evaluation if the folder has an earlier fit.
         """
         job, status = self.job, Status.finished
-        job.task.check()  # what cannot be fitted leaves nothing behind
+        job.task.check()  # before anything is written
         for name, fields in self.scenes.items():
             write_text(self._scene(name), yaml.safe_dump(dict(fields), sort_keys=False))
         if seconds is not None:
-            warm.implicit()  # a compilation, which is done once, is none of the time and cannot be interrupted
+            warm.implicit()  # compile first: this cannot be interrupted, and should not count as fit time
         record: FitRecord | None = None
         intervals: Intervals | None = None
         try:
@@ -74,15 +74,15 @@ class ClothFit:
             status = Status.budget_reached if is_over() else Status.interrupted
             record = record or job.known()
             if record is None and not (self.out / "fit.json").exists():
-                record = job.begun()  # an earlier run's fit is worth more than the place where this one begins
+                record = job.begun()  # the start of the fit; not written if there is a fit of an earlier run
             if record is None and status == Status.budget_reached:
                 raise DiffCloudError(
                     "The time of --budget was over before a first loss was known. The fit of an earlier run stays. Give "
                     "more time."
                 ) from None
-            if record is None:  # Ctrl-C once more, or before a first loss beside an earlier fit
+            if record is None:  # Ctrl-C again, or before the first loss evaluation with an earlier fit in the folder
                 raise
-        if intervals is None:  # what was reached has some, too
+        if intervals is None:  # compute them for the interrupted fit too
             intervals = self._intervals(record)
         told = Told(record, compared(record, self._with_grip_found(record)), intervals, status)
         findings = findings_of(told)
@@ -90,7 +90,7 @@ class ClothFit:
         return told, findings
 
     def _scene(self, name: str) -> Path:
-        """The file of a scenario of an unfinished fit."""
+        """Path of a scenario file while the fit is unfinished."""
         return self.out / "stages" / "scenes" / f"{name}.yaml"
 
     def _intervals(self, record: FitRecord) -> Intervals | None:
@@ -100,7 +100,7 @@ class ClothFit:
         return intervals_of(record, space_of(record), scenario, level=chosen.level, within=chosen.identified_factor)
 
     def _with_grip_found(self, record: FitRecord) -> list[Recording]:
-        """The recordings in scenarios with the grasp that was found; their files have it too."""
+        """Return the recordings with the estimated grasp in their scenarios, and update the scenario files."""
         found = None if record.estimate is None else record.estimate.grip_m
         if found is None:
             return list(self.members)
@@ -126,12 +126,12 @@ class ClothFit:
             write_text(out / "report.html", page)
             if told.intervals is not None:
                 write_json(out / "intervals.json", told.intervals.model_dump(mode="json"))
-        if told.intervals is None:  # those of an earlier run are of another fit
+        if told.intervals is None:  # the old intervals belong to an earlier fit
             (out / "intervals.json").unlink(missing_ok=True)
 
 
 def _copy(source: Path, target: Path) -> None:
-    """Write nothing where nothing would change."""
+    """Copy a file, unless the target already has the same contents."""
     content = source.read_bytes()
     if not target.is_file() or target.read_bytes() != content:
         write_bytes(target, content)

@@ -1,4 +1,4 @@
-"""Jobs on other machines, by a Dask scheduler whose workers have this version of the package and see the same folders."""
+"""Run jobs on other machines with a Dask scheduler. Its workers need the same package version and the same folders."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ from typing import Any, TypeVar
 from diffcloud.errors import ConfigError, DiffCloudError
 
 _ANSWER_S = 10.0
-"""Within which a scheduler answers."""
+"""Time within which a scheduler must answer."""
 Item = TypeVar("Item")
 Found = TypeVar("Found")
 
 
 @contextmanager
 def scheduler_client(address: str) -> Iterator[Any]:
-    """A Dask client of a scheduler.
+    """Connect to a Dask scheduler and yield the client.
 
     Raises:
-        ConfigError: none answers.
+        ConfigError: no scheduler answers.
     """
     from distributed import Client
 
@@ -33,11 +33,11 @@ def scheduler_client(address: str) -> Iterator[Any]:
 
 
 def results_in_order(client: Any, work: Callable[[Item], Found], items: Sequence[Item]) -> Iterator[Found]:
-    """What becomes of each item on the workers, in the order of the items.
+    """Apply a function to the items on the workers, and yield the results in the order of the items.
 
     Raises:
-        DiffCloudError: the scheduler or its workers are gone; what jobs have written stays.
-        KeyboardInterrupt: Ctrl-C; what has not begun is cancelled.
+        DiffCloudError: the scheduler or its workers are gone. Files written by jobs remain.
+        KeyboardInterrupt: Ctrl-C. Jobs that have not started are cancelled.
     """
     futures = [client.submit(_from_folder, os.getcwd(), work, item, pure=False) for item in items]
     try:
@@ -46,7 +46,7 @@ def results_in_order(client: Any, work: Callable[[Item], Found], items: Sequence
                 found = future.result()
             except DiffCloudError:
                 raise
-            except Exception as error:  # of many kinds, where Dask has lost its workers
+            except Exception as error:  # Dask raises several types if it has lost its workers
                 raise DiffCloudError(
                     f"The Dask scheduler or its workers ended without a word ({type(error).__name__}: {error}). What is "
                     "finished is kept; run the command again."
@@ -58,6 +58,6 @@ def results_in_order(client: Any, work: Callable[[Item], Found], items: Sequence
 
 
 def _from_folder(folder: str, work: Callable[[Item], Found], item: Item) -> Found:
-    """On a worker: paths of a job are relative to the folder of the command."""
+    """Run an item on a worker, in the folder of the command, because a job's paths are relative to it."""
     os.chdir(folder)
     return work(item)

@@ -1,4 +1,4 @@
-"""Running the comparison over many episodes: several processes, finished episodes kept, tables written."""
+"""Compare methods on many episodes in parallel. Finished episodes are kept, and tables are written."""
 
 from __future__ import annotations
 
@@ -27,42 +27,42 @@ from diffcloud.regressors import Regressor, predict_episode
 from diffcloud.scene.scenarios import Scenario
 
 _CODE = ("mesh", "io", "sim", "scene", "clouds", "estimation", "evaluation")
-"""Packages whose source decides the numbers of a finished episode."""
+"""Packages whose source code affects the result of an episode."""
 
 _MOST_REASONS = 5
 
 
 @dataclass(frozen=True)
 class Job:
-    """One episode to compare; what it needs travels to another process."""
+    """Comparison of all methods on one episode. It is picklable, so it can run in another process."""
 
     scenario: Scenario
     group: str
-    """Folder of the scenario's episodes and fits."""
+    """Name of the folder with the scenario's episodes and fits."""
     name: str
     fit: str
-    """Name of its fit."""
+    """Name of the episode's fit."""
     recording: int
-    """The episode's place among those of the fit."""
+    """Index of the episode among the recordings of the fit."""
     episode: Episode
     fitted: FitRecord
     predictions: Sequence[Estimate | Gap]
     transfers: Mapping[str, Mapping[str, float]]
     settings: ComparisonSettings
     kept: Path
-    """Where the finished record is kept."""
+    """File for the finished record."""
 
     @property
     def label(self) -> str:
         return f"{self.group}/{self.name}"
 
     def run(self, tell: Tell) -> EpisodeRecord:
-        """The record, from the file if that belongs to the same inputs and code.
+        """Return the record. It is read from `kept` if that file has the same inputs and code.
 
         Raises:
             DiffCloudError: the fitted parameters cannot be simulated.
         """
-        # seconds of predictions differ from run to run, and change nothing in the record
+        # The times of predictions are not part of the inputs: they vary between runs and do not affect the record.
         told = [(entry.method, entry.values if isinstance(entry, Estimate) else entry.reason) for entry in self.predictions]
         inputs = [self.name, self.fit, self.episode, self.fitted.plain(), told, self.transfers, self.settings]
         mark = fingerprint([self.scenario, self.group, *inputs], packages=_CODE)
@@ -85,16 +85,16 @@ class Job:
 
 @dataclass
 class Comparison:
-    """What came of all jobs."""
+    """Results of all comparison jobs."""
 
     records: list[dict[str, Any]] = field(default_factory=list)
     seconds: dict[tuple[str, str], dict[str, dict[str, float]]] = field(default_factory=dict)
     failures: list[str] = field(default_factory=list)
-    """Episodes of which nothing could be said."""
+    """Messages about episodes without any result."""
 
     @property
     def missing(self) -> list[str]:
-        """Everything that should be there and is not."""
+        """Messages about failed episodes and missing expected methods."""
         gaps = [
             f"{record['scenario']}/{record['episode']}: {gap['method']}: {gap['reason']}"
             for record in self.records
@@ -105,10 +105,10 @@ class Comparison:
 
 
 def compare(jobs: Sequence[Job], workers: int | None, scheduler: str | None = None) -> Comparison:
-    """All episodes.
+    """Run all comparison jobs.
 
     Raises:
-        DiffCloudError: nothing could be compared in any of them.
+        DiffCloudError: all of them failed.
     """
     comparison = Comparison()
     for job, found, error in run_all("evaluate", jobs, workers, scheduler=scheduler):
@@ -134,14 +134,14 @@ def comparison_jobs(
     simulated: Path,
     kept: Path,
 ) -> list[Job]:
-    """The episodes of one scenario, in the order of their fits.
+    """Create the comparison jobs of one scenario, in the order of its fits.
 
     Args:
-        group: folder of its episodes, fits and networks.
-        kept: folder of finished episodes.
+        group: name of the folder with its episodes, fits and networks.
+        kept: folder for the records of finished episodes.
 
     Raises:
-        ConfigError, EpisodeError: a damaged fit or episode.
+        ConfigError, EpisodeError: a fit or episode is damaged.
     """
     found = [(path.stem, read_fit(path)) for path in [*files_in(fits / group, ".json"), *joint_fit(fits)]]
     fitted = [
@@ -151,13 +151,13 @@ def comparison_jobs(
         if recording.scenario == scenario.name
     ]
     recorded = {name: read_episode(episodes / group / f"{name}.npz") for _, name, _, _ in fitted}
-    alone = {name: fit for _, name, _, fit in fitted if len(fit.episodes) == 1}  # a joint fit has seen its targets
+    alone = {name: fit for _, name, _, fit in fitted if len(fit.episodes) == 1}  # a joint fit used the target episodes
     values = {name: fit.values for name, fit in alone.items()}
     others = other_repeats({name: episode.meta for name, episode in recorded.items()}, values)
     networks = _networks(config, group, regressors, simulated)
     jobs = []
     for fit_name, name, number, fit in fitted:
-        label = name if fit_name == name else f"{fit_name}-{name}"  # a joint fit has several episodes
+        label = name if fit_name == name else f"{fit_name}-{name}"  # unique, since a joint fit has several episodes
         real = not recorded[name].meta.get("truth")
         jobs.append(
             Job(
@@ -169,7 +169,7 @@ def comparison_jobs(
                 episode=recorded[name],
                 fitted=fit,
                 predictions=[network.of(recorded[name]) for network in networks],
-                # simulated targets share labels, not parameters
+                # No transfers between simulated targets: they share labels, but not parameters.
                 transfers=others[name] if real and len(fit.episodes) == 1 else {},
                 settings=config.evaluate.comparison(f"{group}/{label}", config.fit),
                 kept=kept / group / f"{label}.json",
@@ -180,16 +180,16 @@ def comparison_jobs(
 
 @dataclass(frozen=True)
 class _Network:
-    """A trained network, or why there is none."""
+    """A trained network, or the reason why there is none."""
 
     model: str
     regressor: Regressor | None
     reason: str
     expected: bool
     seconds: Mapping[str, float]
-    """Of its data set and its training."""
+    """Wall times of data set and training [s]."""
     level: float | None
-    """Of the intervals that a posterior tells; None: none."""
+    """Probability of the intervals of a posterior network. None: no intervals."""
 
     def of(self, episode: Episode) -> Estimate | Gap:
         if self.regressor is None:
@@ -227,13 +227,13 @@ def _networks(config: Config, scenario: str, regressors: Path, simulated: Path) 
                 found.append(_Network(model, None, str(error), True, {}, level))
         elif model in asked:
             found.append(_Network(model, None, f"no checkpoint {path}; run `diffcloud network train`", True, {}, level))
-        elif model != "posterior":  # an extra, which nobody misses
+        elif model != "posterior":  # the posterior network is optional, so it is not reported as missing
             reason = "not trained for this scenario (train.scenes, train.models)"
             found.append(_Network(model, None, reason, False, {}, level))
     return found
 
 
 def write_tables(folder: Path, tables: Mapping[str, pd.DataFrame]) -> None:
-    """One CSV each."""
+    """Write each table as a CSV file."""
     for name, table in tables.items():
         write_text(folder / f"{name}.csv", table.to_csv(index=False))

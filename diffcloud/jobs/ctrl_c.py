@@ -1,8 +1,8 @@
-"""A Ctrl-C that a library turns into another error still ends the command as a Ctrl-C.
+"""Detect a Ctrl-C even if a library converts it to another error.
 
-Python raises KeyboardInterrupt wherever the main thread is. Where that is inside a library's C code, the library may drop
-it and raise an error of its own (numpy's comparison of structured arrays: a TypeError without a cause). In a callback of
-the interpreter it is lost altogether.
+Python raises KeyboardInterrupt in the main thread. If this thread is inside C code of a library, the library may drop
+the exception and raise its own. For example, numpy raises a TypeError without a cause when it compares structured
+arrays. In a callback of the interpreter, the exception is lost.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ from contextlib import contextmanager
 from diffcloud.errors import DiffCloudError
 
 _heard: list[int] = []
-"""The end of a pipe where the interpreter writes the number of each signal, whatever becomes of its exception."""
+"""Read end of a pipe to which the interpreter writes each signal number, even if the exception is lost."""
 
 
 def listen() -> None:
-    """Note each Ctrl-C from now on; only the main thread may call this."""
+    """Record each Ctrl-C from now on. Only the main thread may call this."""
     if not _heard:
         read, write = os.pipe()
         for end in (read, write):
@@ -29,20 +29,20 @@ def listen() -> None:
         signal.set_wakeup_fd(write, warn_on_full_buffer=False)
         _heard.append(read)
         sys.unraisablehook = _press_again
-    was_pressed()  # one before this does not count
+    was_pressed()  # forget a Ctrl-C from before this call
 
 
 @contextmanager
 def none_lost() -> Iterator[None]:
-    """An error that a Ctrl-C was turned into within this block is a KeyboardInterrupt again.
+    """Raise KeyboardInterrupt if an unexpected error ends this block after a Ctrl-C.
 
     Raises:
-        KeyboardInterrupt: from an error that is none of the project's own, after a Ctrl-C.
+        KeyboardInterrupt: instead of an error that is not a DiffCloudError, after a Ctrl-C.
     """
     try:
         yield
     except KeyboardInterrupt:
-        was_pressed()  # who catches it has answered this one
+        was_pressed()  # clear the record, since the caller handles this Ctrl-C
         raise
     except DiffCloudError:
         raise
@@ -54,18 +54,18 @@ def none_lost() -> Iterator[None]:
 
 @contextmanager
 def pressed_after(seconds: float | None) -> Iterator[Callable[[], bool]]:
-    """As if Ctrl-C were pressed, if this block still runs after so many seconds; only the main thread may call this.
+    """Raise KeyboardInterrupt, as for a Ctrl-C, if this block runs longer than `seconds`.
 
-    It is a signal of its own: a command that a script starts in the background ignores that of Ctrl-C.
+    SIGALRM is used, because background commands of a shell script ignore SIGINT. Only the main thread may call this.
 
     Args:
-        seconds: None: never.
+        seconds: time limit. None: no limit.
 
     Yields:
-        Whether it was this that pressed.
+        Function that returns whether the time limit was reached.
 
     Raises:
-        KeyboardInterrupt: the time is over.
+        KeyboardInterrupt: the time limit was reached.
     """
     over = threading.Event()
 
@@ -86,17 +86,17 @@ def pressed_after(seconds: float | None) -> Iterator[Callable[[], bool]]:
 
 
 def was_pressed() -> bool:
-    """Whether Ctrl-C was pressed since this was last asked."""
+    """Whether Ctrl-C was pressed or the time limit was reached since the last call."""
     try:
         return bool(_heard) and not {signal.SIGINT, signal.SIGALRM}.isdisjoint(os.read(_heard[0], 1 << 16))
-    except BlockingIOError:  # nothing was written
+    except BlockingIOError:  # the pipe is empty
         return False
 
 
 def _press_again(lost: sys.UnraisableHookArgs) -> None:
-    """Python loses a Ctrl-C that comes in a callback, such as those of the import system: it is pressed once more then."""
+    """Send SIGINT again if a KeyboardInterrupt was lost in a callback, for example of the import system."""
     if isinstance(lost.exc_value, KeyboardInterrupt):
-        # a real signal, which ends a wait of the main thread too
+        # A real signal also interrupts a blocking wait of the main thread.
         again = threading.Timer(0.02, signal.pthread_kill, (threading.main_thread().ident, signal.SIGINT))
         again.daemon = True
         again.start()

@@ -1,4 +1,4 @@
-"""What `diffcloud fit` wrote becomes a project of DVC, in place."""
+"""Turn the output folder of `diffcloud fit` into a DVC project."""
 
 from __future__ import annotations
 
@@ -54,10 +54,10 @@ stages:
 
 
 def make_project(folder: Path) -> None:
-    """Write dvc.yaml and params.yaml beside the files of a fit, which stay.
+    """Write dvc.yaml and params.yaml beside the files of a fit, which remain unchanged.
 
     Raises:
-        ConfigError: the folder is a project, the fit did not finish there, or DVC refuses.
+        ConfigError: the folder already is a project, its fit is not finished, or DVC fails.
     """
     record = _identified(folder)
     pages = {"params.yaml": _PARAMS.format(options=_options(folder, record)), "dvc.yaml": _DVC}
@@ -78,14 +78,15 @@ def make_project(folder: Path) -> None:
 
 
 def _above(folder: Path, name: str) -> Path | None:
-    """The folder, or its nearest parent, that has an entry of that name."""
+    """Return the folder or its nearest parent that contains an entry `name`, or None."""
     return next((one for one in (folder.resolve(), *folder.resolve().parents) if (one / name).exists()), None)
 
 
 def _start_dvc(folder: Path) -> None:
-    """
+    """Run `dvc init` in a folder.
+
     Raises:
-        ConfigError: DVC refused, or is not installed.
+        ConfigError: DVC failed, or is not installed.
     """
     git = _above(folder, ".git")
     kind = ["--no-scm"] if git is None else [] if git == folder.resolve() else ["--subdir"]
@@ -97,10 +98,10 @@ def _start_dvc(folder: Path) -> None:
 
 
 def _identified(folder: Path) -> FitRecord:
-    """The fit that `diffcloud fit` left there.
+    """Read the finished fit in a folder.
 
     Raises:
-        ConfigError: it did not finish there, or a recording is no longer there.
+        ConfigError: the fit is not finished, or a recording is missing.
     """
     needed = ["cloth.yaml", "recordings.yaml", "fit.json", "fit.npz", "intervals.json", "report.html"]
     if missing := [name for name in needed if not (folder / name).is_file()]:
@@ -118,7 +119,7 @@ def _identified(folder: Path) -> FitRecord:
 
 
 def _options(folder: Path, record: FitRecord) -> str:
-    """Options with which `diffcloud fit` arrives at the same fit."""
+    """Return the options for `diffcloud fit` that reproduce the fit."""
     options = ["--parameters", ",".join(record.fitted)]
     if (weighed := record.parameters.get("density")) is not None and weighed.fixed:
         options += ["--density", f"{weighed.value:.12g}"]

@@ -1,4 +1,4 @@
-"""What the comparison of all methods leaves: metrics, tables, wall times."""
+"""Write the results of the comparison of all methods: metrics, tables, wall times."""
 
 from __future__ import annotations
 
@@ -39,13 +39,16 @@ def evaluate(
     """Compare all methods on all episodes. Ctrl-C keeps finished episodes.
 
     Args:
-        fits, episodes, regressors, simulated: folders of <scenario>/; networks and their sets may lack.
+        fits: folder with <scenario>/<episode>.json.
+        episodes: folder with <scenario>/<episode>.npz.
+        regressors: folder with <scenario>/<model>.safetensors, which may be missing.
+        simulated: folder with the simulated sets <scenario>/, which may be missing.
         out: folder for metrics.json, seconds.csv and tables/.
-        markdown: a page of the tables, if wanted.
+        markdown: path of a page with the tables, if wanted.
 
     Raises:
-        ConfigError: no fits.
-        DiffCloudError: nothing could be compared.
+        ConfigError: there are no fits.
+        DiffCloudError: all comparisons failed.
     """
     if not joint_fit(fits) and not any(files_in(fits / name, ".json") for name in config.scenes):
         raise ConfigError(f"{fits} holds no fits of {', '.join(config.scenes)}; run `python -m pipeline.fit` first.")
@@ -79,11 +82,11 @@ def write_evaluation(
     as_json: bool,
     references: Mapping[tuple[str, str], float] | None = None,
 ) -> dict[str, Any]:
-    """Write metrics, wall times and tables, print the main ones, and return all metrics; metrics.json has the main ones.
+    """Write metrics, wall times and tables, print the main ones, and return all metrics.
 
     Args:
         fits: folder with <scenario>/<episode>.json.
-        markdown: a page of the tables, if wanted.
+        markdown: path of a page with the tables, if wanted.
         references: see `summary.method_table`.
     """
     curves, residuals = _curves(config, fits)
@@ -101,7 +104,7 @@ def write_evaluation(
     with together():
         write_tables(out / "tables", frames)
         write_json(out / "tables" / "comparison.json", whole)
-        write_tables(out, {"seconds": told["seconds"]})  # not among the tables: it differs from run to run
+        write_tables(out, {"seconds": told["seconds"]})  # not in tables/, because wall times differ between runs
         if markdown is not None:
             write_text(markdown, comparison_page(told, comparison.missing, config.report.title))
         write_json(out / "metrics.json", headline(told))
@@ -114,7 +117,7 @@ def write_evaluation(
 
 
 def printed(told: Mapping[str, pd.DataFrame]) -> list[Table]:
-    """Means per scenario and method, and fits per episode, for a terminal."""
+    """Tables for a terminal: losses per episode, and means per scenario and method."""
     means = Table("scenario", "method", "episodes", "loss", "rms mm", "other frames mm", "two-sided", "best", "runs")
     for row in told["means"].to_dict("records"):
         cells = (row[key] for key in ("rms_mm", "rms_other_frames_mm", "two_sided", "best", "simulations"))
@@ -131,7 +134,7 @@ def printed(told: Mapping[str, pd.DataFrame]) -> list[Table]:
 
 
 def _curves(config: Config, fits: Path) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
-    """Of all fits: losses of each iteration, RMS of each frame."""
+    """Return the loss of each iteration and the RMS of each frame, for all fits."""
     curves: list[dict[str, Any]] = []
     residuals: list[dict[str, Any]] = []
     named = [path for name in config.scenes for path in files_in(fits / name, ".json")]
@@ -151,7 +154,7 @@ def _curves(config: Config, fits: Path) -> tuple[list[dict[str, Any]], list[dict
 
 
 def _predictions(records: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """A row for each network and episode: what is predicted, and the loss of the simulation with it."""
+    """One row per network and episode: predicted parameters, and the loss of the simulation with them."""
     return [
         {"scenario": record["scenario"], "episode": record["episode"], "model": row["method"]}
         | {f"predicted_{name}": value for name, value in row["values"].items()}
@@ -164,14 +167,14 @@ def _predictions(records: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
 
 
 def _columns(predictions: list[dict[str, Any]]) -> list[str]:
-    """Of the table of predictions, which has its first ones also when it is empty."""
+    """Column names of the table of predictions. An empty table has the first three columns."""
     return list(dict.fromkeys(["scenario", "episode", "model", *(key for row in predictions for key in row)]))
 
 
 def _metrics(fits: pd.DataFrame, predictions: list[dict[str, Any]]) -> dict[str, Any]:
     by_scenario: dict[str, Any] = {}
     for name, group in fits.groupby("scenario", sort=False) if len(fits) else ():
-        columns = ("loss_start", "loss", "rms_mm", "rms_other_frames_mm")  # starts may diverge, other frames be missing
+        columns = ("loss_start", "loss", "rms_mm", "rms_other_frames_mm")  # all may be missing in some rows
         by_scenario[str(name)] = {column: float(group[column].mean()) for column in columns if group[column].notna().any()}
     episodes = {
         f"{row['scenario']}/{row['episode']}": {k: v for k, v in row.items() if isinstance(v, float) and not math.isnan(v)}

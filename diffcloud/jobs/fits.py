@@ -1,4 +1,4 @@
-"""Fits as jobs: which recordings belong to one, what it writes, and what of an earlier call is kept."""
+"""Fits as jobs: their recordings, their output files, and the reuse of finished results."""
 
 from __future__ import annotations
 
@@ -25,35 +25,35 @@ from diffcloud.jobs.scenarios import choose_scenario
 from diffcloud.scene.scenarios import Scenario
 
 JOINT = "joint"
-"""Name of the fit of one parameter set to all recordings."""
+"""Name of the joint fit of all recordings."""
 _CODE = ("mesh", "io", "sim", "scene", "clouds", "estimation")
-"""Packages whose source decides the numbers of a fit."""
+"""Packages whose source code affects the result of a fit."""
 _MOST_JOINT = 100
-"""Recordings of a joint fit, each of whose steps simulates all of them."""
+"""Largest number of recordings in a joint fit. Each step of the fit simulates all of them."""
 
 
 def fit_file(fits: Path, scenario: str, name: str) -> Path:
-    """JSON of a fit: a joint one over several scenarios lies beside their folders."""
+    """Return the JSON path of a fit. A joint fit of several scenarios is in `fits` itself."""
     path = fits / scenario / f"{name}.json"
     return path if path.is_file() or name != JOINT else fits / f"{name}.json"
 
 
 def joint_fit(fits: Path) -> list[Path]:
-    """The JSON of a joint fit over all scenarios, if there is one."""
+    """Return the JSON path of the joint fit of all scenarios, if it exists, as a list."""
     path = fits / f"{JOINT}.json"
     return [path] if path.is_file() else []
 
 
 @dataclass(frozen=True)
 class FitJob:
-    """A fit with its files. A finished one of the same inputs by the same code is kept."""
+    """A fit with its files. A finished result with the same inputs and code is reused."""
 
     name: str
     recordings: Sequence[Recording]
     settings: FitSettings
     folder: Path
     init: Mapping[str, float] = field(default_factory=dict)
-    """Values of the first start; the middle of the range where not given."""
+    """Parameter values of the first start. Others start at mid-range."""
 
     @cached_property
     def task(self) -> FitTask:
@@ -61,7 +61,7 @@ class FitJob:
 
     @property
     def scenario(self) -> Scenario:
-        """Of the first recording."""
+        """Scenario of the first recording."""
         return self.recordings[0].scenario
 
     @property
@@ -71,14 +71,14 @@ class FitJob:
 
     @property
     def files(self) -> tuple[Path, Path]:
-        """What `run` writes."""
+        """Output files (JSON, NPZ) of `run`."""
         return self.folder / f"{self.name}.json", self.folder / f"{self.name}.npz"
 
     def known(self) -> FitRecord | None:
-        """What this job, or an earlier one of the same inputs and code, has left; maybe interrupted."""
+        """Return an existing result with the same inputs and code, possibly of an interrupted fit, or None."""
         try:
             record = read_fit(self.files[0])
-        except ConfigError:  # none, or a damaged one
+        except ConfigError:  # missing or damaged
             return None
         return record if record.fingerprint == self._fingerprint and self.files[1].is_file() else None
 
@@ -112,11 +112,10 @@ class FitJob:
         return record
 
     def begun(self) -> FitRecord:
-        """The place where the fit begins, written and returned as a fit that was interrupted there: for who has been
-        interrupted before the first loss, and must tell something.
+        """Write and return the start of the fit, for an interrupt before the first loss evaluation.
 
         Raises:
-            DivergedError: the motion diverges there.
+            DivergedError: the simulation diverges at the start.
         """
         return self._written(self.task.begun())
 
@@ -127,12 +126,12 @@ class FitJob:
 
     @cached_property
     def _fingerprint(self) -> str:
-        # the name and the recordings tell whether it is joint; level and factor are of what is said of it
+        # Whether the fit is joint follows from name and recordings. The last two settings only affect the report.
         settings = self.settings.model_dump(exclude={"joint", "level", "identified_factor"})
         resolved = [
             self.task.space,
             self.task.solver_settings,
-        ]  # with defaults from outside of these packages
+        ]  # resolved, because defaults may come from other packages
         return fingerprint([self.name, self.recordings, settings, resolved], packages=_CODE)
 
 
@@ -144,22 +143,23 @@ def fit_all(
     workers: int | None,
     scheduler: str | None = None,
 ) -> Iterator[tuple[FitJob, FitRecord | None, str | None]]:
-    """Fit every episode, or all together if the settings say so. Finished fits are kept; fits of episodes that are gone are
-    removed.
+    """Fit every episode, or all episodes jointly if the settings say so.
+
+    Finished fits are reused. Fits whose episode was deleted are removed.
 
     Args:
         episodes: folder of <scenario>/<episode>.npz.
         out: folder for <scenario>/<episode>.json and .npz, or joint.json and joint.npz.
 
     Yields:
-        Fit, its record, and the message of its error; after Ctrl-C, what is known of the rest.
+        Each fit with its record, or with an error message. After Ctrl-C, the best known results of the others.
 
     Raises:
-        ConfigError, EpisodeError: no episodes, or a damaged one; before anything is fitted.
-        KeyboardInterrupt: Ctrl-C; the best so far of each is written.
+        ConfigError, EpisodeError: there are no episodes, or one is damaged. Nothing has been fitted then.
+        KeyboardInterrupt: Ctrl-C. The best result of each running fit is written.
     """
     jobs = _jobs(episodes, out, scenarios, settings)
-    # stated before, so that what an interrupted call leaves is known too
+    # Write the manifest first, so that it also lists files of an interrupted call.
     write_manifest(out, read_manifest(out) | {path.relative_to(out).as_posix() for job in jobs for path in job.files})
     done, failed = set[str](), False
     try:
@@ -196,15 +196,17 @@ def _jobs(episodes: Path, out: Path, scenarios: Sequence[str], settings: FitSett
     jobs = [FitJob(JOINT, members, settings, out)] if settings.joint else []
     if not settings.joint:
         jobs = [FitJob(one.name, [one], settings, out / name) for (name, _), one in zip(files, members, strict=True)]
-    # everything is read before anything is fitted: a damaged last file must not cost the first ones' time
+    # Check everything before the first fit, so that a damaged last file does not waste the time of the others.
     for job in told_progress("checking", jobs):
         job.task.check()
     return jobs
 
 
 def remove_stale(out: Path, jobs: Sequence[FitJob]) -> None:
-    """Remove fits that an earlier call left there and that this one's inputs no longer give: of episodes that are gone, or
-    with other settings. Finished single fits stay beside a joint one, and the reverse."""
+    """Remove fits of earlier calls that do not belong to the present episodes and settings.
+
+    Finished single fits are kept beside a joint fit, and vice versa.
+    """
     if jobs[0].name == JOINT:
         others = [
             replace(job, name=one.name, recordings=[one], folder=out / one.scenario.name)

@@ -1,8 +1,8 @@
-"""The process that forks workers, started while this one still imports.
+"""Start the process that forks workers while the command is still importing.
 
-torch and the kernels take seconds to import. Without a server, the command would wait for that, and then its workers.
-The server imports the same modules in parallel with the command and forks workers that have them already. The command
-itself must not fork: with torch's threads the child may hang, and it would inherit the locks on folders.
+torch and the compiled kernels take seconds to import, first in the command and then in its workers. A fork server
+imports the same modules in parallel with the command, and forks workers that already have them. The command itself must
+not fork: with torch's threads the child may hang, and it would inherit locks on folders.
 """
 
 from __future__ import annotations
@@ -17,27 +17,27 @@ from multiprocessing.context import BaseContext
 from diffcloud.sim.threads import cores
 
 _KIND = "forkserver" if sys.platform == "linux" else "spawn"
-"""On macOS, libraries that torch loads may not survive a fork."""
+"""Start method. On macOS, libraries that torch loads may not survive a fork."""
 
 
 def worker_context() -> BaseContext:
-    """How worker processes start: forked from the server on Linux, spawned elsewhere."""
+    """Return the multiprocessing context: fork server on Linux, spawn elsewhere."""
     return multiprocessing.get_context(_KIND)
 
 
 def begin_importing(module: str, arguments: Sequence[str]) -> None:
-    """Let the server import a command's module, if its arguments ask for several workers; else do nothing.
+    """Start the fork server and let it import a command's module. Without several workers, do nothing.
 
     Args:
-        arguments: of the command line, after `diffcloud`.
+        arguments: command-line arguments after `diffcloud`.
     """
     if _KIND == "spawn" or asked_workers(arguments) < 2:
         return
     from multiprocessing import forkserver
 
     worker_context().set_forkserver_preload(["diffcloud.cli.app", module])
-    # Ctrl-C is meant for this process, which tells its workers. The server and its workers inherit the blocked signal. The
-    # tracker starts first, because starting it unblocks signals
+    # Block SIGINT, so that the server and its workers inherit the blocked signal: only this process reacts to Ctrl-C,
+    # and tells its workers. Start the resource tracker first, because its start unblocks signals.
     resource_tracker.ensure_running()
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
@@ -47,8 +47,11 @@ def begin_importing(module: str, arguments: Sequence[str]) -> None:
 
 
 def asked_workers(arguments: Sequence[str]) -> int:
-    """The value of --workers. Without it, the default (one per core) for a stage, which has --params, and 1 for other
-    commands, which mostly have one job. Invalid values are left for the command to report."""
+    """Return the number of workers that --workers requests.
+
+    The default is one per core for pipeline stages (with --params) and 1 for other commands. Invalid values count as 1,
+    since the command reports them.
+    """
     told = _after("--workers", arguments)
     if told is None:
         return 1 if _after("--params", arguments) is None else cores()
@@ -59,7 +62,7 @@ def asked_workers(arguments: Sequence[str]) -> int:
 
 
 def _after(option: str, arguments: Sequence[str]) -> str | None:
-    """The value of an option, as two words or with an equals sign."""
+    """Return the value of an option, given as two words or with an equals sign, or None."""
     for index, word in enumerate(arguments):
         name, equals, value = word.partition("=")
         if name == option:

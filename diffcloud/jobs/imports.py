@@ -1,4 +1,4 @@
-"""Existing recordings become episodes: what kind they are, and how each kind is read."""
+"""Import existing recordings as episodes: detect their kind and read them."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ from diffcloud.sensing.fusion import FusionSettings
 from diffcloud.sensing.visible_region import with_cut_planes
 
 _FARTHEST_M = 50.0
-"""From the robot's base: no cloth hangs there."""
+"""Largest plausible distance of a point from the robot's base."""
 _KINDS = {
     "clouds": "a folder of clouds",
     "release": "the published data",
@@ -43,7 +43,7 @@ _KINDS = {
     "realsense": "a RealSense recording",
     "folder": "a depth folder",
 }
-"""Kind of source -> how messages call it."""
+"""Kind of source -> its description in messages."""
 _RECORDINGS = ("ros", "realsense", "folder")
 _OF = {
     "--gripper": ("clouds",),
@@ -60,19 +60,19 @@ _OF = {
     "--urdf": ("ros",),
     "--trajectories": ("release",),
 }
-"""Option -> the kinds of source that it belongs to."""
+"""Option -> kinds of sources for which it is valid."""
 _IMAGE_SIGNS = ("depth", "camera.json", "intrinsics.json", "camera_intrinsic.json", "intrinsic.json")
-"""What a depth folder holds."""
+"""File and folder names that identify a depth folder."""
 
 
 def source_kind(sources: list[Path], stated: str | None = None) -> str:
-    """Return what the sources are: clouds, release, ros, realsense or folder (of depth images).
+    """Return the kind of the sources: clouds, release, ros, realsense or folder (of depth images).
 
     Args:
-        stated: clouds, recording or release, in place of what the files show; None to look.
+        stated: clouds, recording or release, instead of detection. None: detect the kind from the files.
 
     Raises:
-        ConfigError: nothing that can be imported, files of several kinds, or a kind that takes one folder with several.
+        ConfigError: the kind is unknown, the sources have several kinds, or the kind allows only one folder.
     """
     paths = named(sources).values()
     kinds = {stated or _general_kind(path) for path in paths}
@@ -95,10 +95,10 @@ def source_kind(sources: list[Path], stated: str | None = None) -> str:
 
 
 def _general_kind(path: Path) -> str:
-    """clouds, recording or release, by what lies there.
+    """Detect the kind of a path: clouds, recording or release.
 
     Raises:
-        ConfigError: a folder with signs of none of them, or of several.
+        ConfigError: a folder looks like none of them, or like several.
     """
     if not path.is_dir():
         if path.suffix.lower() in FORMATS:
@@ -124,9 +124,10 @@ def _general_kind(path: Path) -> str:
 
 
 def refuse_others(source: list[Path], found: str, given: list[str]) -> None:
-    """
+    """Check that all given options are valid for this kind of source.
+
     Raises:
-        ConfigError: an option belongs to other kinds of source.
+        ConfigError: an option belongs to other kinds.
     """
     for option in given:
         if found not in _OF[option]:
@@ -139,7 +140,7 @@ def refuse_others(source: list[Path], found: str, given: list[str]) -> None:
 
 @writes()
 def import_release(folder: Path, out: Path, trajectories: Path | None) -> dict[str, Any]:
-    """Write the published data as episodes; the names by folder, for the result."""
+    """Write the published data as episodes, and return the names of the written episodes per folder."""
     tracks = {} if trajectories is None else _tracks(folder, trajectories)
     written: dict[str, list[str]] = {}
     recorded: dict[Path, Episode] = {}
@@ -167,7 +168,7 @@ def import_clouds(
     labels: dict[str, str],
     viewpoints: dict[str, list[float]],
 ) -> dict[str, Any]:
-    """Write a folder of clouds and the tracks of grippers as an episode; file and counts, for the result."""
+    """Write a folder of clouds and gripper tracks as an episode. Return the file name and counts."""
     meta: dict[str, Any] = {**labels, **({"viewpoints": viewpoints} if viewpoints else {})}
     episode = cloud_folder(folder, grippers=named_files(gripper) if gripper else None, rate_hz=rate_hz, meta=meta)
     far = float(np.abs(episode.points).max())
@@ -193,10 +194,10 @@ def import_recording(
     labels: dict[str, str],
     play: Callable[[dict[str, Path]], AbstractContextManager[Recording]],
 ) -> dict[str, Any]:
-    """Write depth recordings as a raw episode; counts and warnings, for the result.
+    """Write a depth recording as a raw episode. Return counts and warnings.
 
     Args:
-        play: opens recordings of the RealSense SDK.
+        play: function that opens recordings of the RealSense SDK.
     """
     with ExitStack() as stack:
         if kind == "ros":
@@ -226,7 +227,7 @@ def ros_choices(
     topics: list[str] | None,
     urdf: Path | None,
 ) -> dict[str, Any]:
-    """What options choose in a ROS recording, as `ros_recording` takes it."""
+    """Convert command-line options to keyword arguments of `ros_recording`."""
     frames = {"world_frame": world_frame, "tool_frame": tool_frame}
     names = [name.strip() for item in joints or [] for name in item.split(",")]
     if not all(names):
@@ -241,10 +242,10 @@ def ros_choices(
 
 
 def _gripper(text: str) -> dict[str, Any]:
-    """NAME[,OPEN,CLOSED], or none, as `ros_recording` takes it.
+    """Parse NAME[,OPEN,CLOSED] or `none` to keyword arguments of `ros_recording`.
 
     Raises:
-        ConfigError: something else.
+        ConfigError: the text has another form.
     """
     name, *positions = (part.strip() for part in text.split(","))
     if text.strip() == "none":
@@ -262,7 +263,7 @@ def _gripper(text: str) -> dict[str, Any]:
 
 
 def _tracks(folder: Path, trajectories: Path) -> dict[str, NDArray[np.float64]]:
-    """The tracks of those motions whose recordings are there."""
+    """Read the tracks of the motions whose recordings exist in the folder."""
     folders = {kind: RELEASE_FOLDERS[kind][0] for kind in RECORDED_START_M}
     kinds = tuple(kind for kind, name in folders.items() if (folder / name).is_dir())
     if not kinds:
@@ -274,7 +275,7 @@ def _tracks(folder: Path, trajectories: Path) -> dict[str, NDArray[np.float64]]:
 
 
 def _recorded(kind: str, name: str, published: Episode, track: NDArray[np.float64]) -> Episode:
-    """The recording without strays; of known cameras with the heights at which their points were cut off."""
+    """Return the recording without stray points. If its cameras are known, add their crop planes."""
     episode = without_strays(recorded_episode(kind, name, published, track), FusionSettings.cluster_gap_m)
     if episode.camera is not None:
         return with_cut_planes(episode)
@@ -286,7 +287,7 @@ def _recorded(kind: str, name: str, published: Episode, track: NDArray[np.float6
 
 
 def _corrected(recorded: dict[Path, Episode]) -> dict[Path, Episode]:
-    """The recordings with the second camera corrected against the first, by one correction for each set-up."""
+    """Correct the second camera of the recordings against the first, with one correction per camera setup."""
     result = dict(recorded)
     groups: dict[tuple[Path, str], dict[Path, Episode]] = {}
     for path, episode in recorded.items():
@@ -318,17 +319,17 @@ def named(sources: list[Path]) -> dict[str, Path]:
 
 
 def robot_description(urdf: Path | None) -> RobotDescription:
-    """A URDF's, or that of the package's own Gen3."""
-    from diffcloud.sensing.robot import gen3  # not above: it brings torch
+    """Read a URDF, or return the description of the package's own Gen3."""
+    from diffcloud.sensing.robot import gen3  # imported here because it imports torch
 
     return gen3().description if urdf is None else read_urdf(urdf)
 
 
 def recording_kind(path: Path) -> str:
-    """ros, realsense or folder.
+    """Detect the kind of a recording: ros, realsense or folder.
 
     Raises:
-        ConfigError: a file of another kind.
+        ConfigError: the file has another kind.
     """
     if (path / "meta" / "info.json").is_file() and not (path / "metadata.yaml").is_file():
         raise ConfigError(
@@ -339,7 +340,7 @@ def recording_kind(path: Path) -> str:
         return "ros" if (path / "metadata.yaml").is_file() else "folder"
     if path.suffix not in (".bag", ".db3", ".mcap"):
         raise ConfigError(f"{path}: unknown kind of recording; allowed are .bag, .db3, .mcap and folders.")
-    # the SDK's files are bags too, and name their topics after the device
+    # Recordings of the RealSense SDK are bags too. Their topic names start with the device.
     marker = b"/device_0/sensor_"
     with open_input(path, kind="recording", error=ConfigError, most_bytes=sys.maxsize) as stream:
         tail = b""
@@ -361,10 +362,10 @@ def _with_log(found: Recording, path: Path, offset_s: float) -> Recording:
 
 
 def viewpoints(items: list[str] | None) -> dict[str, list[float]]:
-    """NAME=X,Y,Z items as camera -> [x, y, z] [m].
+    """Parse NAME=X,Y,Z items to camera name -> [x, y, z] [m].
 
     Raises:
-        ConfigError: what is not NAME=X,Y,Z, or a camera that is named twice.
+        ConfigError: an item has another form, or a camera occurs twice.
     """
     found: dict[str, list[float]] = {}
     for item in items or []:

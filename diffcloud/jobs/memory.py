@@ -1,4 +1,4 @@
-"""How this process treats memory: that of the allocator, and that of the collector of garbage."""
+"""Tuning of the memory allocator and the garbage collector."""
 
 from __future__ import annotations
 
@@ -9,16 +9,16 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 _TRIM, _MMAP = -1, -3
-"""`M_TRIM_THRESHOLD` and `M_MMAP_THRESHOLD` of glibc's malloc.h."""
+"""Values of `M_TRIM_THRESHOLD` and `M_MMAP_THRESHOLD` in glibc's malloc.h."""
 _KEEP_BYTES = 1 << 30
 
 
 def keep_freed_memory() -> bool:
-    """Let glibc keep large blocks that were freed, for the next one; whether that could be set.
+    """Let glibc keep freed large blocks for reuse. Return whether this was possible.
 
-    By default it returns them to the system and gets them again, emptied page by page: training and simulation, which
-    allocate megabytes in every operation, then spend a third of their time there (measured). Where the C library is
-    another one, nothing happens.
+    By default, glibc returns large blocks to the system, and the system clears each page when it is allocated again.
+    Training and simulation allocate megabytes in every operation and spend a third of their time on this (measured).
+    With another C library, this has no effect.
     """
     if platform.libc_ver()[0] != "glibc":
         return False
@@ -28,8 +28,10 @@ def keep_freed_memory() -> bool:
 
 @contextmanager
 def imports() -> Iterator[None]:
-    """What is imported here stays to the end, so no collector of garbage need go through it: neither meanwhile, nor later,
-    nor at the end, which takes a third of the time that a command needs to start and to stop."""
+    """Exclude objects imported in this block from garbage collection, since they live until the process ends.
+
+    Collecting them takes a third of the time in which a command starts and stops.
+    """
     gc.disable()
     try:
         yield

@@ -1,6 +1,6 @@
-"""Settings of simulated sets and of networks: one field for each, from which options, params.yaml and the page are made.
+"""Settings of simulated sets and networks. Options, params.yaml and the documentation are generated from these fields.
 
-Nothing here imports torch, so that help is quick.
+This module does not import torch, so that `--help` is fast.
 """
 
 from __future__ import annotations
@@ -17,31 +17,31 @@ class GenerateSettings(Section):
     """Simulated sets for the regressors."""
 
     scenes: Names = ["lift", "fold"]
-    """Those that the pipeline makes sets of."""
+    """Scenes for which the pipeline makes sets."""
     parameters: Names = ["stretching", "density"]
     """Parameters to vary, comma-separated."""
     distribution: Literal["uniform", "sobol", "logarithmic", "modes"] = "uniform"
-    """Of the parameters, over their bounds; logarithmic: uniform in the logarithm where the lower bound is positive;
-    modes: the published mixture of soft, medium and stiff cloths."""
+    """Distribution of the parameters within their bounds. logarithmic: uniform in the logarithm if the lower bound is
+    positive; modes: the published mixture of soft, medium and stiff cloths."""
     uncertain: Name | None = None
-    """Other material that varies from run to run by such factors: bending=1.5x,air_density=1.3x. Default: none."""
+    """Other material that varies between runs by these factors: bending=1.5x,air_density=1.3x. Default: none."""
     train: CountOrNone = 1500
-    """Runs to train on."""
+    """Number of training runs."""
     test: CountOrNone = 375
-    """Runs to test on."""
+    """Number of test runs."""
     seed: Seed = 0
-    """Of the parameters and of exported clouds."""
+    """Seed of the parameters and of exported clouds."""
 
 
 class TrainSettings(Section):
-    """Of networks. What is not given (null) is the profile's (`diffcloud.regressors.settings`)."""
+    """Training of networks. Omitted values (null) are those of the profile (`diffcloud.regressors.settings`)."""
 
     scenes: Names = ["lift", "fold"]
-    """Those that the pipeline trains for."""
+    """Scenes for which the pipeline trains networks."""
     models: Names = Field(default=["mlp", "pointnet2", "meteornet"], json_schema_extra={"flag": "--model"})
     """mlp, pointnet2, meteornet, or posterior (an extra); comma-separated."""
     profile: Literal["quick", "reduced", "paper"] = "reduced"
-    """All hyper-parameters."""
+    """Preset of all hyper-parameters."""
     epochs: Count | None = None
     """Passes over the training runs."""
     draws: Count | None = None
@@ -52,15 +52,15 @@ class TrainSettings(Section):
     target: Literal["linear", "logarithmic"] | None = None
     augment: bool | None = None
     viewpoints: tuple[tuple[Component, Component, Component], ...] | None = None
-    """Places in the scene, in its length unit: clouds show what cameras there see."""
+    """Camera positions in the scene, in its length unit. Clouds then have only points that these cameras see."""
     subtract_background: bool | None = None
     predict_variance: bool | None = None
     patience: Count | None = None
     seed: Seed | None = None
-    """Of all random numbers."""
+    """Seed of all random numbers."""
     device: Literal["auto", "cpu", "gpu"] = "auto"
-    """Where to train; gpu: in mixed precision."""
+    """Where to train. gpu uses mixed precision."""
 
     def changes(self) -> dict[str, object]:
-        """What differs from the profile."""
+        """Return the values that differ from the profile."""
         return self.model_dump(exclude={"scenes", "models", "profile", "device"}, exclude_none=True)

@@ -1,4 +1,4 @@
-"""Many independent jobs, in this process or in several."""
+"""Run many independent jobs, in this process or in several."""
 
 from __future__ import annotations
 
@@ -25,23 +25,24 @@ from diffcloud.jobs.memory import imports, keep_freed_memory
 from diffcloud.sim.threads import cores, use_threads
 
 Tell = Callable[[float, str], None]
-"""What a job may call with (fraction done, text)."""
+"""Callback for the progress of a job: (fraction done, text)."""
 
 _stop: Event | None = None
-"""Of a worker: set when Ctrl-C was pressed."""
+"""In a worker: event that is set when Ctrl-C was pressed."""
 
 
 class Job(Protocol):
-    """Travels to another process, and so does what it gives."""
+    """A job. Jobs and their results must be picklable."""
 
     @property
     def label(self) -> str:
-        """What a progress display shows."""
+        """Text for the progress display."""
 
     def run(self, tell: Tell) -> Any:
-        """
+        """Run the job and return its result.
+
         Raises:
-            DiffCloudError: an error of this job alone; the others go on.
+            DiffCloudError: this job failed. Other jobs continue.
         """
 
 
@@ -51,16 +52,16 @@ AnyJob = TypeVar("AnyJob", bound=Job)
 def run_all(
     title: str, jobs: Sequence[AnyJob], workers: int | None, *, patient: bool = False, scheduler: str | None = None
 ) -> Iterator[tuple[AnyJob, Any, str | None]]:
-    """(job, what it gave, message of its error) in the order of the jobs.
+    """Run all jobs. Yield (job, result, error message) in the order of the jobs.
 
     Args:
-        workers: processes, each with one thread; 1: this one; None: one per core.
-        scheduler: address of a Dask scheduler, whose workers run the jobs instead and see the same folders.
-        patient: after Ctrl-C, wait for running jobs, which look at `check_interrupt`; else their processes end at once.
+        workers: number of processes, each with one thread. 1: this process. None: one per core.
+        scheduler: address of a Dask scheduler whose workers run the jobs instead. They need the same folders.
+        patient: after Ctrl-C, wait for running jobs, which must call `check_interrupt`. Otherwise kill their processes.
 
     Raises:
         ConfigError: no scheduler answers.
-        DiffCloudError: a process died, or the scheduler did.
+        DiffCloudError: a process or the scheduler died.
         KeyboardInterrupt: Ctrl-C.
     """
     workers = cores() if workers is None else workers
@@ -82,8 +83,8 @@ def run_all(
         context = worker_context()
         stop = context.Event()
         with (
-            # jobs travel in files: a pool whose processes have ended waits for ever to send them what does not fit into a
-            # pipe (Python before 3.11.5, gh-94777)
+            # Send jobs in files. Before Python 3.11.5, a pool whose processes have died blocks forever while sending
+            # data that exceed the pipe's buffer (gh-94777).
             TemporaryDirectory(prefix="diffcloud-") as folder,
             ProcessPoolExecutor(
                 min(workers, len(jobs)), mp_context=context, initializer=_begin, initargs=(stop, patient)
@@ -99,17 +100,17 @@ def run_all(
                 raise DiffCloudError(
                     "A worker process died, probably because memory ran out. Try fewer --workers."
                 ) from error
-            except BaseException:  # Ctrl-C, or nobody wants the rest
+            except BaseException:  # Ctrl-C, or the caller stopped the iteration
                 stop.set()
                 pool.shutdown(wait=False, cancel_futures=True)
                 raise
 
 
 def check_interrupt() -> None:
-    """For a job, now and then.
+    """Raise KeyboardInterrupt if the jobs should stop. Jobs call this regularly.
 
     Raises:
-        KeyboardInterrupt: Ctrl-C was pressed; of a worker, in its parent; here, and a library has dropped the exception.
+        KeyboardInterrupt: Ctrl-C was pressed in the parent process, or in this process and a library dropped it.
     """
     if (_stop is not None and _stop.is_set()) or ctrl_c.was_pressed():
         raise KeyboardInterrupt
@@ -123,7 +124,7 @@ def _attempt(job: Job, tell: Tell = lambda done, text: None) -> tuple[Any, str |
 
 
 def _attempt_there(job: Job) -> tuple[Any, str | None]:
-    """Of a worker of Dask's."""
+    """Run a job on a Dask worker, with one thread."""
     _one_thread()
     use_threads(1)
     return _attempt(job)
@@ -136,7 +137,7 @@ def _stored(job: Job, path: Path) -> Path:
 
 def _attempt_stored(path: Path) -> tuple[Any, str | None]:
     with imports():
-        job: Job = pickle.loads(path.read_bytes())  # which this program has just written
+        job: Job = pickle.loads(path.read_bytes())  # trusted: this program has just written it
     path.unlink()
     return _attempt(job)
 
@@ -146,14 +147,14 @@ def _tell(update: Callable[[float, str], None], index: int, label: str, done: fl
 
 
 def _one_thread() -> None:
-    """Of torch, also where the environment allows it more: sums in several threads may end in other last bits."""
+    """Limit torch to one thread, because sums over several threads may differ in the last bits."""
     with imports():
-        import torch  # here, not as this module is imported: by now the collector waits
+        import torch  # imported here, so that the garbage collector is paused
     torch.set_num_threads(1)
 
 
 def _begin(stop: Event, patient: bool) -> None:
-    """Of a worker: Ctrl-C is the parent's, and one thread is its share of the cores."""
+    """Set up a worker: ignore Ctrl-C, which the parent handles, and use one thread."""
     global _stop
     _stop = stop
     signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -166,7 +167,7 @@ def _begin(stop: Event, patient: bool) -> None:
 
 
 def _end_with_parent() -> None:
-    """A process that is killed cannot tell its workers; without this they would wait for it forever."""
+    """End this worker when its parent dies. A killed parent cannot notify its workers, which would wait forever."""
     parent = multiprocessing.parent_process()
     if parent is not None:
         parent.join()

@@ -1,4 +1,4 @@
-"""Raw episodes to clouds, and clouds to clean ones."""
+"""Convert raw episodes to clouds, and clean clouds."""
 
 from __future__ import annotations
 
@@ -29,9 +29,9 @@ from diffcloud.sensing.pictures import cloud_picture, mask_picture
 from diffcloud.sensing.robot import Robot, gen3
 
 PICTURES = ("mask", "cloud")
-"""Of a raw episode: <episode>.<kind>.png beside its clouds."""
+"""Kinds of pictures of a raw episode: <episode>.<kind>.png beside its clouds."""
 _CODE = ("mesh", "io", "clouds", "sensing")
-"""Packages whose source decides the clouds."""
+"""Packages whose source code affects the clouds."""
 
 
 def preprocess(
@@ -43,31 +43,32 @@ def preprocess(
     calibration: Path | None = None,
     workers: int | None = None,
 ) -> tuple[dict[str, dict[str, list[int]]], list[str], list[str]]:
-    """Clean every recording into OUT/<scenario>/<episode>.npz. Finished episodes are kept until the recording, a setting or
-    the code changes. Of a folder, clouds whose recording is gone are removed.
+    """Clean every recording and write it to OUT/<scenario>/<episode>.npz.
+
+    Finished episodes are reused until the recording, a setting or the code changes. If whole folders are given, clouds
+    whose recording was deleted are removed.
 
     Args:
         recorded: raw episodes, or folders of recordings.
-        calibration: file with the cameras of raw episodes.
+        calibration: calibration file of the cameras of raw episodes.
 
     Returns:
-        <scenario>/<episode> -> points of each frame, recorded and kept; warnings; and what failed, beside which the others
-        are cleaned all the same.
+        <scenario>/<episode> -> points per frame, recorded and kept; warnings; errors of episodes that failed.
 
     Raises:
-        ConfigError: no recording, or two of one name.
+        ConfigError: there is no recording, or two have the same name.
     """
-    sources = _sources([path.absolute() for path in recorded], config.scenes)  # "." has no name
+    sources = _sources([path.absolute() for path in recorded], config.scenes)  # absolute, because "." has no name
     calibrated = None if calibration is None else read_calibration(calibration)
     if any(path.is_dir() for _, path in sources):
-        robot_mask(settings.raw)  # a robot that cannot be read must not cost an episode's time
+        robot_mask(settings.raw)  # load the robot first, so that errors in its description are found early
     jobs = [PreprocessJob(scenario, path, out, settings, calibrated) for scenario, path in sources]
     whole = not any((path / "episode.json").is_file() for path in recorded)
     written, marks = read_manifest(out), read_marks(out)
     wanted = {job.result: job.fingerprint() for job in jobs}
     cleaned = {name: done for name, mark in wanted.items() if marks.get(name) == mark and (done := _kept(out / name))}
     finished = {name: wanted[name] for name in cleaned}
-    # stated before, so that what an interrupted call leaves is known, and taken for unfinished
+    # Write the manifest first, so that files of an interrupted call are known, and considered unfinished.
     others = {} if whole else {name: mark for name, mark in marks.items() if name not in wanted}
     marks = others | finished
     write_manifest(out, written | {name for job in jobs for name in job.files}, marks)
@@ -96,20 +97,20 @@ def preprocess(
 
 @dataclass(frozen=True)
 class Cleaned:
-    """What became of an episode."""
+    """Summary of a cleaned episode."""
 
     points: dict[str, list[int]]
-    """Per frame, recorded and kept."""
+    """Number of points per frame: recorded and kept."""
     warnings: list[str]
 
 
 @dataclass(frozen=True)
 class PreprocessJob:
-    """One episode to fuse, if it is a raw one, and to clean."""
+    """One episode to clean. A raw episode is converted to clouds first."""
 
     scenario: str
     path: Path
-    """Episode file or raw episode."""
+    """Path of an episode file or of a raw episode."""
     out: Path
     settings: PreprocessConfig
     calibration: Calibration | None
@@ -124,17 +125,17 @@ class PreprocessJob:
 
     @property
     def result(self) -> str:
-        """The clean episode, relative to `out`."""
+        """Path of the cleaned episode, relative to `out`."""
         return f"{self.scenario}/{self.name}.npz"
 
     @property
     def files(self) -> list[str]:
-        """What `run` writes, relative to `out`."""
+        """Paths of the files that `run` writes, relative to `out`."""
         pictures = [f"{self.scenario}/{self.name}.{kind}.png" for kind in PICTURES] if self.path.is_dir() else []
         return [self.result, *pictures]
 
     def fingerprint(self) -> str:
-        """Of the recording's files and of all that decides what becomes of them."""
+        """Return the fingerprint of the recording's files and of everything that affects the result."""
         names = raw_episode_files(self.path)[0] if self.path.is_dir() else [""]
         recording = {name: sha256((self.path / name).read_bytes()).hexdigest() for name in names}
         robot = _robot(self.settings.raw) if self.path.is_dir() else None
@@ -142,10 +143,10 @@ class PreprocessJob:
         return fingerprint([*plan, None if robot is None else robot.description], packages=_CODE)
 
     def run(self, tell: Tell) -> Cleaned:
-        """Write the clean episode, with pictures of a raw one.
+        """Write the cleaned episode, and pictures if it is a raw episode.
 
         Raises:
-            EpisodeError: a damaged episode, or one of which nothing is left.
+            EpisodeError: the episode is damaged, or no points remain.
         """
         pictures = raw = None
         try:
@@ -173,7 +174,7 @@ class PreprocessJob:
 
 
 def _kept(path: Path) -> Cleaned | None:
-    """What an earlier run left there; None if there is nothing, or something damaged."""
+    """Summarise the result of an earlier run, or return None if it is missing or damaged."""
     try:
         return _told(read_episode(path))
     except EpisodeError:
@@ -186,11 +187,11 @@ def _told(episode: Episode) -> Cleaned:
 
 
 def _sources(recorded: list[Path], scenarios: list[str]) -> list[tuple[str, Path]]:
-    """(scenario, episode file or raw episode) of each episode.
+    """List all recordings as (scenario, path of an episode file or raw episode).
 
     Raises:
-        ConfigError: no recording at all, two of one name in a scenario, or a raw episode that is named itself and names no
-            scenario.
+        ConfigError: there is no recording, two in one scenario have the same name, or a raw episode given by its path
+            has no scenario.
     """
     found = [source for path in recorded for source in _within(path, scenarios)]
     names = [f"{scenario}/{_stem(path)}" for scenario, path in found]
@@ -207,7 +208,7 @@ def _sources(recorded: list[Path], scenarios: list[str]) -> list[tuple[str, Path
 
 
 def _within(recorded: Path, scenarios: list[str]) -> list[tuple[str, Path]]:
-    """As `_sources`, of one argument; scenarios without a recording are passed over."""
+    """As `_sources`, for one argument. Scenarios without recordings are skipped."""
     if (recorded / "episode.json").is_file():
         return [(_scenario(recorded), recorded)]
     if not recorded.is_dir():
@@ -217,7 +218,7 @@ def _within(recorded: Path, scenarios: list[str]) -> list[tuple[str, Path]]:
         for path in _raw_in(folder):
             try:
                 found.append((_scenario(path), path))
-            except ConfigError as error:  # such as that of a board, for the calibration
+            except ConfigError as error:  # for example, a recording of the calibration board
                 warn(f"Left out: {error}")
         for inner in folders_in(folder):
             paths = [*_raw_in(inner), *files_in(inner, ".npz")]
@@ -248,7 +249,7 @@ def _stem(path: Path) -> str:
 
 @cache
 def robot_mask(raw: RawConfig) -> RobotMask | None:
-    """Of the robot that the settings name; None where they name none."""
+    """Return the mask of the robot in the settings, or None if they have no robot."""
     robot = _robot(raw)
     return None if robot is None else RobotMask(robot, robot_margin_m=raw.robot_margin_m)
 
@@ -261,13 +262,14 @@ def _robot(raw: RawConfig) -> Robot | None:
 
 
 def aligned(episode: Episode, config: PreprocessConfig, name: str, raw: RawEpisode | None) -> Episode:
-    """The recording of this name with one camera corrected against another, if the settings name both.
+    """Return the recording with one camera corrected against another, if the settings name two cameras.
 
     Args:
-        raw: what the clouds were made of; None if they come from a file.
+        name: name of the recording.
+        raw: raw episode from which the clouds were made. None if they come from a file.
 
     Raises:
-        EpisodeError: other cameras, views that cannot be compared, or clouds that are not in metres.
+        EpisodeError: the cameras are unknown, their views cannot be compared, or clouds are not in metres.
     """
     if config.align_cameras is None:
         return episode
@@ -282,7 +284,7 @@ def aligned(episode: Episode, config: PreprocessConfig, name: str, raw: RawEpiso
 
 
 class _Pictures:
-    """Two pictures of a raw episode's middle frame: <episode>.mask.png and <episode>.cloud.png."""
+    """Two pictures of the middle frame of a raw episode: <episode>.mask.png and <episode>.cloud.png."""
 
     def __init__(self, raw: RawEpisode) -> None:
         self.raw = raw
@@ -298,11 +300,11 @@ class _Pictures:
 
 
 def _clean(episode: Episode, config: PreprocessConfig) -> Episode:
-    if episode.meta.get("noise_free"):  # nothing to clean; thinning would only take what the loss compares with
+    if episode.meta.get("noise_free"):  # skip cleaning and thinning: all points are exact, and the loss uses them
         config = config.model_copy(update={"outlier_neighbours": 0, "points": None, "crop_m": None, "radius_m": None})
     rng = np.random.default_rng(config.seed)
     indices, reports = [], []
-    for frame in range(episode.frame_count):  # frames are ragged; each is vectorised
+    for frame in range(episode.frame_count):  # loop, because frames differ in size
         try:
             keep, report = clean_frame(
                 episode.frame(frame),

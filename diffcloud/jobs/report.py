@@ -1,4 +1,4 @@
-"""The pipeline's page about all fits, in one file."""
+"""Write the pipeline's report page of all fits as a single HTML file."""
 
 from __future__ import annotations
 
@@ -33,20 +33,20 @@ from diffcloud.reporting import (
 def write_report(
     out: Path, config: Config, params: Path | None, *, fits: Path, episodes: Path, regressors: Path, tables: Path
 ) -> tuple[int, int]:
-    """Write the page, and its figures beside it.
+    """Write the page, and its figures in a folder beside it.
 
     Args:
-        params: the file of the settings, which the page names.
+        params: settings file, whose name is shown on the page.
         fits: folder with <scenario>/<episode>.json and .npz.
         episodes: folder with <scenario>/<episode>.npz.
-        regressors: folder with <scenario>/<model>/training.json; may lack any.
-        tables: what the stage `evaluate` has written.
+        regressors: folder with <scenario>/<model>/training.json, which may be missing.
+        tables: folder that the stage `evaluate` has written.
 
     Returns:
-        Numbers of episodes and of bytes.
+        Number of episodes, and size of the page [bytes].
 
     Raises:
-        ConfigError, EpisodeError: a table, a fit or an episode that is missing or damaged.
+        ConfigError, EpisodeError: a table, fit or episode is missing or damaged.
     """
     table = tables / "fits.csv"
     if not table.is_file():
@@ -85,7 +85,7 @@ def write_report(
         "parameters": "params.yaml" if params is None else str(params),
         "seed of the fits": str(config.fit.seed),
         "seed of the comparison": str(config.evaluate.seed),
-        "diffcloud": diffcloud.__version__,  # what differs by run or machine lies beside each fit (`io.timings`)
+        "diffcloud": diffcloud.__version__,  # versions and times of a single run are beside each fit (`io.timings`)
     }
     comparison = _comparison(tables, entries)
     predictions = table_rows(tables / "predictions.csv")
@@ -108,17 +108,17 @@ def write_report(
 
 
 def _loss_frames(fit: Path, scenario: str) -> tuple[int, ...]:
-    """Of the scenario of a fit. Those of a published one are known without its scene file, which is not asked for here."""
+    """Loss frames of a fit's scenario. Those of published scenarios are known without the scene file."""
     if scenario in RELEASE:
         return (RELEASE[scenario].loss_frame,)
     return choose_scenario(fitted_scenario(fit, scenario)).loss_frames
 
 
 def _comparison(folder: Path, entries: list[EpisodeEntry]) -> ComparisonEntry:
-    """What the stage `evaluate` has left, with its figures.
+    """Read the results of the stage `evaluate` and draw their figures.
 
     Raises:
-        ConfigError: it has left nothing, or something else.
+        ConfigError: the results are missing or invalid.
     """
     whole = read_json(folder / "comparison.json", error=ConfigError)
     check_file(ComparisonFile, folder / "comparison.json", whole)
@@ -132,18 +132,18 @@ def _comparison(folder: Path, entries: list[EpisodeEntry]) -> ComparisonEntry:
 
 
 def _pictures(folder: Path, name: str) -> dict[str, bytes]:
-    """Of a raw episode, as the stage `preprocess` left them; none of other episodes."""
+    """Pictures of a raw episode that the stage `preprocess` wrote (caption -> PNG). Empty for other episodes."""
     kinds = {"mask": "masked (red) and kept as cloth (green)", "cloud": "merged cloud from above, along y and along x"}
     files = {caption: folder / f"{name}.{kind}.png" for kind, caption in kinds.items()}
     return {caption: path.read_bytes() for caption, path in files.items() if path.is_file()}
 
 
 _NAMES = ("scenario", "episode", "model")
-"""Columns of tables that stay text, whatever episodes are called."""
+"""Columns that are read as text, even if a name looks like a number."""
 
 
 def table_rows(table: Path) -> list[dict[str, Any]]:
-    """Rows of a table as column -> value, without what is not known; none if there is no such table."""
+    """Return the rows of a table as column -> value, without NaN. Empty if the table does not exist."""
     if not table.is_file():
         return []
     return [

@@ -1,4 +1,4 @@
-"""Scenarios by name: built-in ones, a person's own in raw/scenes, and those of fits."""
+"""Find scenarios by name: built-in ones, the user's own in raw/scenes, and those of fits."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ if TYPE_CHECKING:
     from diffcloud.scene.scenarios.catalogue import Options
 
 OWN_SCENARIOS = Path("raw/scenes")
-"""A person's own scenario files, found by name."""
+"""Folder of the user's own scenario files."""
 
 
 def choose_scenario(name: str | None, scene: Path | None = None) -> Scenario:
     """Load a scenario and warn about parts of its scene that are not simulated."""
-    from diffcloud.scene.scenarios import load_scenario  # takes seconds, which help does without
+    from diffcloud.scene.scenarios import load_scenario  # imported here because it takes seconds, also for --help
 
     own = None if name is None else _own(name)
     scenario = load_scenario(name if own is None else own, scene)
@@ -28,11 +28,14 @@ def choose_scenario(name: str | None, scene: Path | None = None) -> Scenario:
 
 
 def scene_named(source: str) -> Scenario:
-    """The scenario that the option --scene names: a built-in, a YAML file, one of raw/scenes, an ARCSim scene JSON, or
-    NAME=FILE.json for a published scenario with its scene file.
+    """Load the scenario that the option --scene names.
+
+    Args:
+        source: a built-in name, a YAML file, a name in raw/scenes, an ARCSim scene JSON, or NAME=FILE.json for a published
+            scenario with its scene file.
 
     Raises:
-        ConfigError, SceneError: none of these, or a damaged file.
+        ConfigError, SceneError: the scenario does not exist, or its file is damaged.
     """
     name, equals, file = source.partition("=")
     if equals and file.endswith(".json") and not Path(source).exists():
@@ -41,10 +44,10 @@ def scene_named(source: str) -> Scenario:
 
 
 def scenario_options(name: str) -> Options:
-    """The fields of a built-in scenario, or of a person's own one, to vary.
+    """Return the fields of a built-in scenario or of the user's own scenario.
 
     Raises:
-        ConfigError, SceneError: neither, or a damaged file.
+        ConfigError, SceneError: the scenario does not exist, or its file is damaged.
     """
     from diffcloud.scene.scenarios import built_in, read_options
 
@@ -53,14 +56,14 @@ def scenario_options(name: str) -> Options:
 
 
 def fitted_scenario(fit: Path, name: str) -> str:
-    """The scenario of a fit, by the name that the fit gives: the file that `diffcloud fit` wrote beside the fit, a
-    built-in or the person's own one of that name, or a file in the current folder.
+    """Find the scenario of a fit: a file written beside the fit, a built-in or own scenario, or a local file.
 
     Args:
-        fit: the JSON file.
+        fit: JSON file of the fit.
+        name: scenario name in the fit.
 
     Raises:
-        ConfigError: none of these.
+        ConfigError: there is no such scenario.
     """
     from diffcloud.scene.scenarios import SCENARIO_NAMES
 
@@ -90,7 +93,7 @@ def _own(name: str) -> Path | None:
 
 
 def limits(scenario: Scenario) -> list[str]:
-    """What the scene asks for and the contact model lacks, and whether its cloth is drawn to another scale."""
+    """Warnings: obstacles that the contact model does not support, and a mesh whose scale is inconsistent."""
     from diffcloud.io.obj import STRETCHED, other_lengths
     from diffcloud.sim.integrators import load_integrator
 

@@ -1,4 +1,4 @@
-"""The scene of each recording of one cloth, in files that a person may edit: OUT/cloth.yaml and OUT/recordings.yaml."""
+"""The scene of each recording of a cloth, in files that the user may edit: OUT/cloth.yaml and OUT/recordings.yaml."""
 
 from __future__ import annotations
 
@@ -37,22 +37,22 @@ def find_scene(
     mass: float | None,
     topics: Sequence[str] = (),
 ) -> tuple[dict[str, Episode], dict[str, Any], dict[str, dict[str, Any]]]:
-    """Read the recordings, and find or read what cloth.yaml and recordings.yaml say of them.
+    """Read the recordings and their scene. Values missing in cloth.yaml and recordings.yaml are estimated and added.
 
     Args:
-        topics: of ROS recordings, those to take where several could be (`ros_recording`).
+        topics: topics of ROS recordings to use if there are several candidates (`ros_recording`).
 
     Returns:
-        Recording -> episode, the cloth's fields of a scenario, and recording -> its own.
+        Recording -> episode; the scenario fields of the cloth; recording -> its own scenario fields.
 
     Raises:
-        EpisodeError: a recording that cannot be used.
-        ConfigError, SceneError: one of both files says what cannot be, or topics without a ROS recording.
+        EpisodeError: a recording cannot be used.
+        ConfigError, SceneError: a file has invalid values, or topics are given without a ROS recording.
     """
     names = named_recordings(recordings)
     episodes = read_all(names, out, topics)
     path = out / "recordings.yaml"
-    with together():  # nothing of a scene that was not found would count in the next run
+    with together():  # after an error, no partial result may affect the next run
         cloth = _cloth(out, episodes, size, mass)
         if cloth["base"] == "hang":
             episodes = {name: _prepared(name, episode, out) for name, episode in episodes.items()}
@@ -72,13 +72,14 @@ def _prepared(name: str, episode: Episode, out: Path) -> Episode:
 
 
 def read_all(names: Mapping[str, Path], out: Path, topics: Sequence[str] = (), *, keep: bool = True) -> dict[str, Episode]:
-    """
+    """Read recordings: name -> path to name -> episode.
+
     Args:
-        keep: whether episode files are copied to OUT/episodes/ too. Other recordings are kept there in any case.
+        keep: also copy episode files to OUT/episodes/. Other recordings are always stored there.
 
     Raises:
-        EpisodeError: a recording that cannot be used.
-        ConfigError: topics without a ROS recording.
+        EpisodeError: a recording cannot be used.
+        ConfigError: topics are given without a ROS recording.
     """
     if topics and not any(map(_is_bag, names.values())):
         raise ConfigError("--topic chooses among the topics of a ROS recording, and none was given. Leave --topic out.")
@@ -86,10 +87,10 @@ def read_all(names: Mapping[str, Path], out: Path, topics: Sequence[str] = (), *
 
 
 def named_recordings(recordings: Sequence[Path]) -> dict[str, Path]:
-    """Name of each recording -> where it lies; a folder of episode files stands for all of them.
+    """Return recording name -> path. A folder of episode files stands for all its files.
 
     Raises:
-        ConfigError: one that is not there, or two of one name.
+        ConfigError: a recording does not exist, or two have the same name.
     """
     named: dict[str, Path] = {}
     for path in [one for given in recordings for one in files_in(given, ".npz") or [given]]:
@@ -107,7 +108,7 @@ def _is_bag(path: Path) -> bool:
 
 
 def read_recording(path: Path, name: str, out: Path, topics: Sequence[str], *, keep: bool) -> Episode:
-    """A recording as an episode; see `read_all`."""
+    """Read a recording as an episode. See `read_all`."""
     kept = out / "episodes" / f"{name}.npz"
     if _is_bag(path):
         path = _unpacked(path, out / "recordings" / name, topics)
@@ -130,7 +131,7 @@ def read_recording(path: Path, name: str, out: Path, topics: Sequence[str], *, k
 
 
 def _unpacked(bag: Path, folder: Path, topics: Sequence[str]) -> Path:
-    """A ROS recording as a raw episode, kept in OUT/recordings/: what `data import` makes of it by default."""
+    """Convert a ROS recording to a raw episode in OUT/recordings/, as `data import` does by default."""
     from diffcloud.jobs.imports import recording_kind, robot_description
 
     if recording_kind(bag) != "ros":
@@ -157,7 +158,7 @@ def _unpacked(bag: Path, folder: Path, topics: Sequence[str]) -> Path:
 def _cloth(
     out: Path, episodes: Mapping[str, Episode], stated: tuple[float, float] | None, mass: float | None
 ) -> dict[str, Any]:
-    """The fields of cloth.yaml: read if it is there, else found and written."""
+    """Return the fields of cloth.yaml. If the file does not exist, detect and write them."""
     path = out / "cloth.yaml"
     if path.is_file():
         fields = read_fields(path)
@@ -166,7 +167,7 @@ def _cloth(
         if stated is not None and list(stated) != fields["size_m"]:
             other = f"--size {stated[0]:g}x{stated[1]:g}"
             warn(f"{path} says size_m {fields['size_m']}, and that counts, not {other}: edit the file.")
-        return with_material_path(fields, out)  # scenarios are written to another folder
+        return with_material_path(fields, out)  # resolve the path, because scenarios are written to another folder
     found = found_cloth(list(episodes.values()), stated, mass)
     write_text(path, _yaml(found))
     return {name: entry.value for name, entry in found.items()}
@@ -175,7 +176,7 @@ def _cloth(
 def _layouts(
     out: Path, episodes: Mapping[str, Episode], sources: Mapping[str, Path], cloth: Mapping[str, Any]
 ) -> dict[str, dict[str, Any]]:
-    """The fields of each recording in recordings.yaml: read where they are there, else found and written."""
+    """Return the fields of each recording in recordings.yaml. Detect and write those that are missing."""
     path = out / "recordings.yaml"
     known = read_fields(path) if path.is_file() else {}
     size, hangs = (float(cloth["size_m"][0]), float(cloth["size_m"][1])), cloth["base"] == "hang"
@@ -210,10 +211,10 @@ def _layouts(
 
 
 def _warn_of_changes(out: Path, episodes: Mapping[str, Episode], stated: Collection[str]) -> None:
-    """Say which recordings are not those any more that their blocks in recordings.yaml were made for, which count.
+    """Warn about recordings that have changed since their block in recordings.yaml was written.
 
     Args:
-        stated: those whose blocks were there before.
+        stated: recordings that had a block before this run.
     """
     path = out / "stages" / "recordings.json"
     told = read_json(path) if path.is_file() else {}
@@ -229,7 +230,7 @@ def _warn_of_changes(out: Path, episodes: Mapping[str, Episode], stated: Collect
 
 
 def _refuse_missing(fields: Mapping[str, Any], needed: Sequence[str], where: str) -> None:
-    """A built-in's own value would stand in for what is missing, and nobody would know."""
+    """Refuse missing fields. Otherwise defaults of the built-in scenario would silently replace them."""
     missing = [name for name in needed if name not in fields]
     if missing:
         raise ConfigError(f"{where} lacks {', '.join(missing)}. Put it back, or remove the whole to have it found anew.")
@@ -249,13 +250,15 @@ def _yaml(found: Mapping[str, Found], *, head: bool = True) -> str:
 
 
 def _inline(value: Any) -> str:
-    """As YAML in one line; a text that would be read as something else, such as the name 001, in quotes."""
+    """Format a value as YAML in one line. Strings that YAML would read as another type, such as 001, are quoted."""
     text: str = yaml.safe_dump(value, default_flow_style=True, width=1000, sort_keys=False)
     return text.strip().removesuffix("...").strip()
 
 
 def scene_fields(source: str) -> dict[str, Any] | None:
-    """The fields of a scene's YAML file, with the path of its material; None of a built-in or a scene JSON, which later
-    commands find by name."""
+    """Return the fields of a scene's YAML file, with the resolved path of its material.
+
+    None for a built-in or a scene JSON, which later commands find by name.
+    """
     path = own_scene(source)
     return None if path is None else with_material_path(read_fields(path), path.parent)

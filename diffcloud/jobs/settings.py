@@ -1,4 +1,4 @@
-"""Settings of each stage: one frozen block per section of params.yaml. Unknown keys and bad values are errors."""
+"""Settings of each pipeline stage, one section of params.yaml each. Unknown keys and invalid values are errors."""
 
 from __future__ import annotations
 
@@ -23,26 +23,26 @@ from diffcloud.settings import Bounds, Count, CountOrNone, Name, Names, Pixels, 
 
 
 class SynthesizeConfig(Section):
-    """Synthetic recordings. A person's own lie in raw/, where `diffcloud data preprocess` finds them."""
+    """Synthetic recordings. The user's own are in raw/, where `diffcloud data preprocess` finds them."""
 
     per_scenario: CountOrNone = 2
-    """Of each scenario; 0: none, only a person's own are used."""
+    """Number of recordings per scenario. 0: use only the user's own."""
     seed: Seed = 0
     true_range: Bounds = (0.3, 3.0)
-    """Hidden multipliers of camera recordings are drawn log-uniformly from it; fully observed scenarios (`recorder:
-    whole_surface`) draw uniformly over the bounds of a fit, as the paper does."""
+    """Range of the hidden multipliers of camera recordings, sampled log-uniformly. Fully observed scenarios (`recorder:
+    whole_surface`) sample uniformly within the bounds of a fit, as in the paper."""
     image_size: tuple[Pixels, Pixels] = (424, 240)
-    """Columns and rows of camera recordings; a D435 offers 424 x 240, 640 x 480, 848 x 480 and more."""
+    """Width and height of camera images; a D435 offers 424 x 240, 640 x 480, 848 x 480 and more."""
     subpixel_px: NonNegative = DepthNoise.subpixel_px
-    """Deviation of the cameras' disparity [px of their imagers]."""
+    """Standard deviation of the cameras' disparity [px of the infrared images]."""
     clock_offset_s: NonNegative = RecorderSettings.clock_offset_s
-    """How late the joint log is."""
+    """Delay of the joint log relative to the images."""
     extrinsic_error: tuple[NonNegative, NonNegative] = (0.0, 0.0)
-    """(millimetres, degrees) by which the stated place of each camera but the first is off."""
+    """Error (millimetres, degrees) in the stated pose of each camera except the first."""
     rig_error: tuple[NonNegative, NonNegative] = (0.0, 0.0)
-    """The same of all cameras together."""
+    """Common error (millimetres, degrees) in the stated poses of all cameras."""
     placement_error: tuple[NonNegative, NonNegative] = (0.0, 0.0)
-    """(millimetres, degrees) by which cloth and gripper are not where the recording says."""
+    """Error (millimetres, degrees) in the stated pose of cloth and gripper."""
 
     def recorder(self) -> RecorderSettings:
         return RecorderSettings(
@@ -61,12 +61,12 @@ class SynthesizeConfig(Section):
 
 
 class RawConfig(Section):
-    """From raw episodes to clouds (`diffcloud.sensing.fusion.FusionSettings` says what each means)."""
+    """Conversion of raw episodes to clouds. `diffcloud.sensing.fusion.FusionSettings` explains each setting."""
 
     robot: Name | None = "gen3"
-    """Whose pixels are masked: `gen3`, the package's own description, or the path of a URDF; null: nobody's."""
+    """Robot whose pixels are masked: `gen3` (included), or the path of a URDF; null: none."""
     robot_margin_m: NonNegative = 0.007
-    """Margin around the robot."""
+    """Margin of the mask around the robot."""
     workspace_m: tuple[Point, Point] = FusionSettings.workspace_m
     imager_offsets_m: Annotated[tuple[Annotated[float, Field(ge=-1, le=1)], ...], Field(max_length=10)] = (
         FusionSettings.imager_offsets_m
@@ -84,7 +84,8 @@ class RawConfig(Section):
     imager_focal_px: Positive = FusionSettings.imager_focal_px
     baseline_m: Positive = FusionSettings.baseline_m
     origin_m: Point | None = None
-    """The scene's origin in the base frame; with `yaw_rad` and `length_unit_m` in place of what episode.json says."""
+    """Origin of the scene in the base frame. It replaces, with `yaw_rad` and `length_unit_m`, the values in
+    episode.json."""
     yaw_rad: Component = 0.0
     length_unit_m: Positive = 1.0
 
@@ -105,19 +106,20 @@ class PreprocessConfig(Section):
 
     raw: RawConfig = RawConfig()
     align_cameras: tuple[Name, Name] | None = None
-    """Names of two cameras: the second one's pose, depth scale and clock are corrected against the first, as far as the
-    recording shows them (`diffcloud.sensing.agreement`). The clouds must be in metres. Off by default, since `raw.refine`
-    finds the cameras' places, and a single recording of a stiff or slow cloth shows little more."""
+    """Names of two cameras. The second one's pose, depth scale and clock are corrected against the first, as far as the
+    recording identifies them (`diffcloud.sensing.agreement`). Clouds must be in metres. Off by default, since
+    `raw.refine` already estimates camera poses, and one recording of a stiff or slow cloth adds little."""
     crop_m: tuple[Point, Point] | None = None
-    """Lowest and highest corner of a box in the scene's frame."""
+    """Lowest and highest corner of the crop box in the scene's frame."""
     outlier_neighbours: CountOrNone = 20
     outlier_std: Positive = 5.0
-    """A merged cloud is of uneven density: 2.5, the paper's, takes thin parts of the cloth."""
+    """Outlier threshold in standard deviations. Merged clouds vary in density: the paper's 2.5 removes thin parts of
+    the cloth."""
     radius_m: Positive | None = None
-    """Points with fewer than `radius_neighbours` others within it are outliers too; in the scene's unit."""
+    """Points with fewer than `radius_neighbours` others within this radius are outliers too; in the scene's unit."""
     radius_neighbours: Count = 4
     points: Count | None = 3500
-    """Kept per frame at most."""
+    """Largest number of points per frame."""
     downsampling: Downsampling = "random"
     seed: Seed = 0
 
@@ -129,20 +131,20 @@ class PreprocessConfig(Section):
 
 
 class EvaluateConfig(Section):
-    """Comparing methods, and what can be known of the parameters."""
+    """Comparison of methods, and identifiability of the parameters."""
 
     draws: Count = 4
-    """Fresh point samples that a loss is averaged over."""
+    """Number of fresh point samples over which a loss is averaged."""
     seed: Seed = 1000
     baselines: Annotated[list[Baseline], Field(max_length=len(BASELINES) + 10)] = list(BASELINES)
-    """Methods beside the fits and the networks; searches may simulate as often as the fit."""
+    """Methods besides fits and networks. Searches may simulate as often as the fit."""
     landscapes: Annotated[list[Name], Field(max_length=10_000)] = []
-    """Patterns of <scenario>/<episode> whose loss landscape is simulated."""
+    """Patterns of <scenario>/<episode> for which the loss landscape is simulated."""
     landscape_size: Annotated[int, Field(ge=2, le=1000)] = 7
-    """Places along each of its axes."""
+    """Number of grid points along each axis of a landscape."""
 
     def comparison(self, episode: str, fit: FitSettings) -> ComparisonSettings:
-        """For <scenario>/<episode>."""
+        """Return the settings of the comparison for <scenario>/<episode>."""
 
         def chosen(patterns: list[str]) -> bool:
             return any(fnmatch(episode, pattern) for pattern in patterns)
@@ -158,11 +160,11 @@ class EvaluateConfig(Section):
 
 
 class ReportConfig(Section):
-    """The page."""
+    """Report page."""
 
     title: Name = "DiffCloud report"
     cloud_points: Count = 1200
-    """Shown per cloud and frame."""
+    """Number of points shown per cloud and frame."""
 
 
 class Config(Section):
@@ -179,10 +181,10 @@ class Config(Section):
 
 
 def load_config(path: Path | None) -> Config:
-    """Read params.yaml; None gives the defaults.
+    """Read params.yaml. None gives the defaults.
 
     Raises:
-        ConfigError: an unreadable file, an unknown key, a bound out of order: names the key and what is allowed.
+        ConfigError: the file is not readable, a key is unknown, or a value is invalid.
     """
     if path is None:
         return Config()

@@ -1,4 +1,4 @@
-"""The first start of a fit: stated, or predicted by a network."""
+"""The first start of a fit: given by the user, or predicted by a network."""
 
 from __future__ import annotations
 
@@ -11,15 +11,16 @@ from diffcloud.io.episodes import Episode
 from diffcloud.regressors import MODEL_NAMES, Regressor, predict_episode
 
 REGRESSORS = Path("data/regressors")
-"""Where the pipeline keeps checkpoints: <scenario>/<model>.safetensors."""
+"""Folder of the pipeline's checkpoints: <scenario>/<model>.safetensors."""
 
 
 def first_start(init: str, task: FitTask) -> dict[str, float]:
-    """Return the multipliers of a first start, which is stated in SI units or predicted. Recordings of a joint fit give the
-    mean of theirs.
+    """Return the multipliers of the first start, from values in SI units or from a network's predictions.
+
+    In a joint fit, the predictions are averaged over the recordings.
 
     Raises:
-        ConfigError: a value of what is not fitted, or outside of its bounds.
+        ConfigError: a value belongs to a parameter that is not fitted, or is out of bounds.
     """
     if "=" in init:
         stated = task.scenario.multipliers(assignments(init.split(","), "--init"), "--init")
@@ -30,14 +31,14 @@ def first_start(init: str, task: FitTask) -> dict[str, float]:
 
 
 def predicted_start(name: str, scenario: str, episode: Episode) -> dict[str, float]:
-    """Parameter -> value within the bounds, for a fit to start from.
+    """Predict parameter values within the bounds, as the start of a fit.
 
     Args:
-        name: a model, for the pipeline's own checkpoint of the scenario, or the path of a checkpoint.
+        name: a model name, for the pipeline's own checkpoint of the scenario, or the path of a checkpoint.
 
     Raises:
-        ConfigError, CheckpointError, EpisodeError: no such checkpoint, one of another scenario, or an episode that lacks
-            the frames that it sees.
+        ConfigError, CheckpointError, EpisodeError: the checkpoint does not exist or belongs to another scenario, or the
+            episode lacks frames that the network needs.
     """
     path = REGRESSORS / scenario / f"{name}.safetensors" if name in MODEL_NAMES else Path(name)
     if name not in MODEL_NAMES and not path.is_file():

@@ -1,4 +1,4 @@
-"""Synthetic recordings of every scenario; a person's own lie in raw/."""
+"""Make synthetic recordings of all scenarios. The user's own recordings are in raw/."""
 
 from __future__ import annotations
 
@@ -33,10 +33,10 @@ _HIDDEN = ("stretching", "density")
 
 
 def make_episodes(config: Config, out: Path, workers: int | None, scheduler: str | None = None) -> dict[str, list[str]]:
-    """Make the recordings in OUT/<scenario>/<episode>, raw or .npz.
+    """Make the recordings in OUT/<scenario>/<episode>, as raw episodes or .npz.
 
     Returns:
-        Scenario -> names.
+        Scenario -> names of the recordings.
     """
     settings = config.synthesize
     jobs = [EpisodesJob(name, index, settings, out / name) for index, name in enumerate(config.scenes)]
@@ -54,11 +54,11 @@ def make_episodes(config: Config, out: Path, workers: int | None, scheduler: str
 
 @dataclass(frozen=True)
 class EpisodesJob:
-    """The recordings of one scenario."""
+    """Makes the recordings of one scenario."""
 
     scenario: str
     index: int
-    """Of the scenario among all; its random numbers depend on it."""
+    """Index of the scenario, from which its random seed is derived."""
     settings: SynthesizeConfig
     out: Path
 
@@ -67,7 +67,7 @@ class EpisodesJob:
         return self.scenario
 
     def run(self, tell: Tell) -> list[str]:
-        """Make them; their names."""
+        """Make the recordings and return their names."""
         scenario = choose_scenario(self.scenario)
         return _synthetic(scenario, self.settings, self.index, self.out, lambda _, text: tell(0.0, text))
 
@@ -75,7 +75,7 @@ class EpisodesJob:
 def _synthetic(
     scenario: Scenario, config: SynthesizeConfig, index: int, out: Path, tell: Callable[[int, str], None]
 ) -> list[str]:
-    """Simulate cloths of hidden parameters and record them: by depth cameras as raw episodes, or by their whole surface."""
+    """Simulate cloths with hidden parameters, and record them with depth cameras or as the whole surface."""
     rng = np.random.default_rng([config.seed, index])
     hidden = hidden_parameters(scenario, config, rng)
     system, nodes, times = simulated_frames(scenario, hidden)
@@ -96,7 +96,10 @@ def _synthetic(
 def simulated_frames(
     scenario: Scenario, values: Mapping[str, NDArray[np.float64]]
 ) -> tuple[System, NDArray[np.float64], NDArray[np.float64]]:
-    """The scenario's system, and its motions [E, T, V, 3] at the times [T] of its frames [s], at parameters [E] by name.
+    """Simulate E motions. Return the system, node positions [E, T, V, 3] at each frame, and frame times [T] [s].
+
+    Args:
+        values: parameter name -> values [E].
 
     Raises:
         DivergedError: a motion diverges.
@@ -123,17 +126,16 @@ def record_motion(
     noise: DepthNoise | None = None,
     tell: Callable[[int, str], None] = lambda done, text: None,
 ) -> None:
-    """Record one simulated motion as the scenario says: its whole surface in OUT/NAME.npz, or by depth cameras in the raw
-    episode OUT/NAME.
+    """Record a simulated motion as the whole surface (OUT/NAME.npz) or with depth cameras (raw episode OUT/NAME).
 
     Args:
-        nodes: [T, V, 3] of the cloth at times [T].
-        seed: of the recorder's noise.
-        noise: of depth cameras; by default what `config` says.
+        nodes: [T, V, 3] node positions of the cloth at times [T].
+        seed: seed of the recorder's noise.
+        noise: noise of depth cameras, by default as in `config`.
         tell: called with (frames done, text).
 
     Raises:
-        ConfigError: several grippers before depth cameras, or something else is where the raw episode would be.
+        ConfigError: depth cameras would record several grippers, or the output folder has other files.
     """
     obstacles, faces = scenario.scene.surrounding.obstacles, system.mesh.faces
     if scenario.recorder == "whole_surface":
@@ -147,7 +149,7 @@ def record_motion(
             f"Scenario {scenario.name} has the grippers {', '.join(grippers)}, but the recorder by depth cameras "
             "has one arm; choose recorder: whole_surface."
         )
-    _replaceable(out / name, "synthetic")  # refused before it is recorded
+    _replaceable(out / name, "synthetic")  # check before the recording starts
     height = float(obstacles[0].nodes[:, 2].max()) if obstacles else float(nodes[0, :, 2].min())
     motion = ClothMotion(nodes, faces, times, scenario.grasped, height)
     cameras = published_cameras(*config.image_size, noise=noise or DepthNoise(subpixel_px=config.subpixel_px))
@@ -157,10 +159,10 @@ def record_motion(
 
 
 def _replaceable(folder: Path, source: str) -> list[str]:
-    """Files of the recording of this source that an earlier run left.
+    """List the files of a recording that an earlier run left in a folder.
 
     Raises:
-        ConfigError: something else is there.
+        ConfigError: the folder has something else.
     """
     if not folder.exists():
         return []
@@ -174,18 +176,21 @@ def _replaceable(folder: Path, source: str) -> list[str]:
 
 def _clear(folder: Path, source: str) -> None:
     remove_files(folder, _replaceable(folder, source))
-    with suppress(OSError):  # not there, or a hidden file of the system's is
+    with suppress(OSError):  # the folder does not exist, or has a hidden file of the system
         folder.rmdir()
 
 
 def hidden_parameters(
     scenario: Scenario, config: SynthesizeConfig, rng: np.random.Generator
 ) -> dict[str, NDArray[np.float64]]:
-    """Hidden multipliers, name -> [episodes]: as the paper draws them for its simulated targets (uniform over the fit's
-    bounds), or log-uniform over the configured range for recordings by cameras."""
+    """Sample hidden multipliers: name -> [episodes].
+
+    Scenarios with whole-surface recordings use the paper's distribution of simulated targets, uniform over the fit's
+    bounds. For camera recordings, multipliers are log-uniform over the configured range.
+    """
     if scenario.recorder == "whole_surface":
         low, high = np.transpose([scenario.bounds.get(name, PARAMETERS[name].bounds) for name in _HIDDEN])
-        drawn = rng.uniform(low, high, (config.per_scenario, len(_HIDDEN)))  # more episodes leave the first as they are
+        drawn = rng.uniform(low, high, (config.per_scenario, len(_HIDDEN)))  # independent of later rows
         return dict(zip(_HIDDEN, drawn.T, strict=True))
     low, high = np.log(config.true_range)
     return {name: np.exp(rng.uniform(low, high, config.per_scenario)) for name in _HIDDEN}

@@ -1,4 +1,4 @@
-"""Training of the networks that tell parameters from clouds."""
+"""Train networks that predict parameters from clouds."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from diffcloud.regressors import (
 )
 
 _CODE = ("mesh", "io", "clouds", "regressors")
-"""Packages whose source decides a training."""
+"""Packages whose source code affects the training."""
 
 
 def train(
@@ -41,20 +41,20 @@ def train(
     workers: int | None = None,
     loaders: int = 0,
 ) -> Iterator[tuple[TrainJob, dict[str, Any] | None, str | None]]:
-    """Train the networks; finished ones of the same settings and data are kept.
+    """Train the networks. Finished ones with the same settings and data are reused.
 
     Args:
-        data: folder of a simulated set; without a scenario, of <scenario>/.
-        out: folder for <model>.safetensors and <model>/; without a scenario, of <scenario>/.
-        scenario: of the only set; None: all of the settings.
-        loaders: processes that sample clouds.
+        data: folder of a simulated set. Without a scenario: folder of <scenario>/.
+        out: folder for <model>.safetensors and <model>/. Without a scenario: folder for <scenario>/.
+        scenario: name of the only scenario. None: all scenarios in the settings.
+        loaders: number of processes that sample clouds.
 
     Yields:
-        Network, what there is to tell, and the message of its error.
+        Each network with its summary, or with an error message.
 
     Raises:
-        ConfigError, DatasetError: sets that are missing or of other scenarios.
-        KeyboardInterrupt: Ctrl-C; the last saved epoch is kept.
+        ConfigError, DatasetError: a set is missing, or belongs to another scenario.
+        KeyboardInterrupt: Ctrl-C. The last saved epoch is kept.
     """
     every = scenario is None
     scenarios = config.scenes if scenario is None else [scenario]
@@ -69,7 +69,7 @@ def train(
     for job in jobs:
         errors.print(f"Training {job.label}: {_described(job.settings, job.train)} ...")
     if workers is None and config.device != "cpu" and torch.cuda.is_available():
-        workers = 1  # trainings at once would share the GPU
+        workers = 1  # parallel trainings would share the GPU
     failed = False
     with none_lost():
         for job, told, error in run_all("train", jobs, workers):
@@ -83,11 +83,11 @@ def train(
 
 
 def viewpoints(path: Path, scenarios: Sequence[str]) -> list[list[float]]:
-    """Of an episode's cameras.
+    """Return the camera positions of an episode [x, y, z].
 
     Raises:
-        ConfigError: it is of another scenario than these.
-        EpisodeError: damaged, or its cameras are not known.
+        ConfigError: the episode belongs to another scenario.
+        EpisodeError: the episode is damaged, or its camera positions are unknown.
     """
     episode = read_episode(path)
     own = episode.meta.get("scenario")
@@ -100,7 +100,7 @@ def viewpoints(path: Path, scenarios: Sequence[str]) -> list[list[float]]:
 
 @dataclass(frozen=True)
 class TrainJob:
-    """One network. A finished one of the same settings and data by the same code is kept."""
+    """Training of one network. A finished network with the same settings, data and code is reused."""
 
     model: str
     train: SimulatedSet
@@ -109,7 +109,7 @@ class TrainJob:
     config: TrainSettings
     folder: Path
     loaders: int
-    """Processes that sample clouds."""
+    """Number of processes that sample clouds."""
 
     @property
     def label(self) -> str:
@@ -117,21 +117,21 @@ class TrainJob:
 
     @property
     def files(self) -> list[Path]:
-        """What `run` has left."""
+        """Files that `run` has written."""
         live = self._checkpoint.with_suffix("")
         return [self._checkpoint, timings_path(self._checkpoint), *(path for path in live.rglob("*") if path.is_file())]
 
     def run(self, tell: Tell) -> dict[str, Any]:
-        """Train, write, and return what there is to tell.
+        """Train the network, write it, and return its summary.
 
         Raises:
-            ConfigError, TrainingError: sets that are too small, or a loss that is no number any more.
-            KeyboardInterrupt: Ctrl-C; the last saved epoch is kept.
+            ConfigError, TrainingError: a set is too small, or the loss is not finite any more.
+            KeyboardInterrupt: Ctrl-C. The last saved epoch is kept.
         """
         known = self._known()
         if known is not None:
             return known
-        # Lightning takes seconds to import, and nothing else needs it
+        # Imported here because Lightning takes seconds to import.
         from diffcloud.regressors.training import TrainingProgress, train_regressor
 
         def show_progress(progress: TrainingProgress) -> None:
@@ -152,14 +152,14 @@ class TrainJob:
         return self._told(result.summary, {"seconds": result.seconds, "resumed": result.resumed_from})
 
     def _known(self) -> dict[str, Any] | None:
-        """What an earlier run of the same settings, data and code has left."""
+        """Return the summary of an earlier run with the same settings, data and code, or None."""
         try:
             told = read_json(self._checkpoint.with_suffix("") / "training.json", error=DatasetError)
             if not isinstance(told, dict) or told.get("fingerprint") != self._fingerprint:
                 return None
             Regressor.read(self._checkpoint)
             return self._told(told, read_timings(self._checkpoint))
-        except (DatasetError, CheckpointError):  # none, or a damaged one: trained again
+        except (DatasetError, CheckpointError):  # missing or damaged: train again
             return None
 
     def _told(self, summary: Mapping[str, Any], timings: Mapping[str, Any]) -> dict[str, Any]:

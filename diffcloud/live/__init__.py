@@ -1,1 +1,1 @@
-"""What cameras see while an episode is recorded."""
+"""Live view of the cameras during a recording."""

@@ -1,7 +1,7 @@
-"""A raw episode while it is being recorded: its newest frame, as clouds in the base frame.
+"""Follow a raw episode during its recording: convert the newest frame to clouds in the base frame.
 
-Only frames that timestamps.csv lists already are read; their images are complete by then (`io.raw_episodes`). So following
-works with any program that writes raw episodes.
+Only frames that timestamps.csv lists are read, since their images are complete (`io.raw_episodes`). So this works with
+any program that writes raw episodes.
 """
 
 from __future__ import annotations
@@ -22,15 +22,15 @@ from diffcloud.sensing.fusion import camera_pose
 
 @dataclass(frozen=True)
 class LiveCloud:
-    """What one camera saw last."""
+    """The newest cloud of one camera."""
 
     frame: int
-    """Its number."""
+    """Frame number."""
     t_s: float
     points: Floats
-    """[P, 3] in the base frame [m], evenly thinned; robot, table and background among them."""
+    """[P, 3] in the base frame [m], subsampled evenly. Robot, table and background are included."""
     colors: NDArray[np.uint8] | None
-    """[P, 3] RGB; None where no colour is recorded."""
+    """[P, 3] RGB. None if colour is not recorded."""
     T_world_camera: Floats
     """[4, 4]"""
     intrinsics: Intrinsics
@@ -43,7 +43,7 @@ class LiveFrame:
     status: str
     """recording, complete or stopped."""
     clouds: Mapping[str, LiveCloud]
-    """Camera -> its newest cloud; without those that have delivered nothing yet."""
+    """Camera name -> its newest cloud. Cameras without frames are absent."""
     tool: Floats | None
     """[3] newest tool position in the base frame [m], if one is logged."""
 
@@ -86,7 +86,7 @@ class Follower:
         return LiveFrame(status, {name: self._cloud(name, camera) for name, camera in cameras.items()}, tool)
 
     def _cloud(self, name: str, camera: RawCamera) -> LiveCloud:
-        if name not in self._poses:  # it is written before the first frame, and does not change
+        if name not in self._poses:  # camera.json is written before the first frame and does not change
             self._poses[name] = camera_pose(camera.info, self._folder, self._calibration)
         last = len(camera.frames) - 1
         depth, color = camera.depth(last), camera.color(last)

@@ -1,4 +1,4 @@
-"""Clouds in a browser while they come, by viser (https://viser.studio), which the extra `live` installs."""
+"""Live view of clouds in a browser, based on viser (https://viser.studio), which the extra `live` installs."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from diffcloud.sensing.cameras import Floats
 
 _POINT_M = 0.004
 _TINTS = ((70, 120, 200), (220, 140, 60), (90, 170, 110), (180, 90, 170))
-"""Of the points of cameras without colour."""
+"""Colours for the points of cameras without colour images."""
 _AXES_M = 0.1
 _FROM_M = np.array([0.9, -0.9, 0.8])
 """Initial viewpoint, relative to the centre of the clouds."""
 
 
 class LivePage:
-    """A page that shows the newest frame; close it with `close`, or use it as a context.
+    """A web page that shows the newest frame. Close it with `close`, or use it as a context manager.
 
     Args:
-        port: of this machine; no other can open the page. If the port is taken, the next free one is used: see `url`.
+        port: local port; other computers cannot open the page. If it is taken, the next free one is used (see `url`).
 
     Raises:
         ConfigError: viser is not installed.
@@ -48,7 +48,7 @@ class LivePage:
         return f"http://127.0.0.1:{self._server.get_port()}"
 
     def show(self, frame: LiveFrame) -> None:
-        """Replace what is shown."""
+        """Replace the displayed frame."""
         from viser.transforms import SO3
 
         scene = self._server.scene

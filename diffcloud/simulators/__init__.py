@@ -1,5 +1,6 @@
-"""The same cloths in this simulator and in others.
+"""Simulate the same cloth in DiffCloud's simulator and in others, to compare them.
 
-`problem` says what a simulator is given, `problems` has two tests whose answers are known; `ours`, `mujoco`, `newton` and
-`explicit` each turn a problem into the motion of its nodes. MuJoCo and Newton are imported when they are run.
+`problem` defines the input of a simulator, and `problems` two tests with analytical solutions. `ours`, `mujoco`,
+`newton` and `explicit` simulate a problem and return the motion of its nodes. MuJoCo and Newton are imported only when
+they are used.
 """

@@ -1,8 +1,8 @@
-"""A third opinion: explicit steps in plain NumPy, whose choices can be this simulator's or MuJoCo's.
+"""Independent reference simulator: explicit steps in plain NumPy, with the model choices of DiffCloud or of others.
 
-The steps of symplectic Euler are short enough that their own error hardly shows, and the forces are written anew. So
-with this simulator's choices they must give its motions, and what changes with one choice is what that choice is worth.
-The table is this simulator's; the cloth does not meet itself.
+Symplectic Euler steps are so short that the time-step error is negligible. The forces are implemented independently.
+With DiffCloud's model choices, results must agree with DiffCloud. So the effect of each other choice can be measured.
+Contact with the table is as in DiffCloud; self-contact is not modelled.
 """
 
 from __future__ import annotations
@@ -23,19 +23,19 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Choices:
-    """Where the simulators differ; the defaults are this simulator's."""
+    """Model choices in which simulators differ. Defaults are those of DiffCloud's simulator."""
 
     rotation_damped: bool = False
-    """Whether damping multiplies the whole stiffness, with the tension in it, which resists rigid rotation too (ARCSim);
-    else the rate of strain alone."""
+    """True: damping is proportional to the full stiffness matrix including tension, and also damps rigid rotation
+    (ARCSim). False: only the strain rate is damped."""
     neo_hookean: bool = False
-    """Whether the membrane is the stable neo-Hookean one of Newton, else Saint Venant's and Kirchhoff's."""
+    """True: stable neo-Hookean membrane as in Newton. False: Saint Venant-Kirchhoff membrane."""
     chord: bool = False
-    """Whether a hinge resists by its chord 2 sin(θ/2) (MuJoCo), else by its angle θ."""
+    """True: bending energy in the hinge chord 2 sin(θ/2) (MuJoCo). False: in the hinge angle θ."""
 
 
 def simulate(problem: Problem, choices: Choices | None = None, *, step: float = 1e-4) -> Track:
-    """The motion in explicit steps of so many seconds."""
+    """Simulate a problem with explicit steps of about `step` seconds."""
     chosen = choices or Choices()
     count = problem.steps_of(step)
     step, total = 1 / (problem.rate * count), (len(problem.times) - 1) * count
@@ -55,15 +55,16 @@ def simulate(problem: Problem, choices: Choices | None = None, *, step: float = 
 
 
 def _gathered(index: NDArray[np.int64], nodes: int) -> csr_array:
-    """[V, index.size] sums what elements put on their nodes."""
+    """Sparse matrix [V, index.size] that sums element contributions at the nodes."""
     flat = index.ravel()
     return csr_array((np.ones(len(flat)), (flat, np.arange(len(flat)))), shape=(nodes, len(flat)))
 
 
 def membrane_force(problem: Problem, chosen: Choices) -> Callable[[Array, Array], Array]:
-    """Stretching and its damping: nodes and velocities [V, 3] -> forces [V, 3].
+    """Return the force of stretching and its damping, as a function of positions and velocities [V, 3] -> forces [V,
+    3].
 
-    The neo-Hookean sheet's energy per area is μ (tr FᵀF - 2)/2 + (λ + μ) (J - α)²/2 with J the ratio of areas and
+    The energy per area of the neo-Hookean membrane is μ (tr FᵀF - 2)/2 + (λ + μ) (J - α)²/2. J is the area ratio and
     α = 1 + μ/(λ + μ).
     """
     mesh, sheet = problem.mesh, problem.sheet
@@ -103,8 +104,10 @@ def membrane_force(problem: Problem, chosen: Choices) -> Callable[[Array, Array]
 
 
 def neo_hookean_gain(problem: Problem, motion: Array) -> float:
-    """The factor on a neo-Hookean membrane's stiffness that brings its forces on the nodes of a motion [T, V, 3] closest,
-    in least squares, to those of the Saint Venant-Kirchhoff membrane."""
+    """Stiffness factor for a neo-Hookean membrane that best matches the forces of the Saint Venant-Kirchhoff membrane.
+
+    The match is a least-squares fit of the node forces over a motion [T, V, 3].
+    """
     still = np.zeros_like(motion[0])
     linear, other = (
         np.array([force(nodes, still) for nodes in motion])
@@ -115,7 +118,7 @@ def neo_hookean_gain(problem: Problem, motion: Array) -> float:
 
 
 def _hinges(problem: Problem, chosen: Choices) -> Callable[[Array, Array], Array]:
-    """Bending over the edges between two faces."""
+    """Return the bending force of the hinges (interior edges), as a function of positions and velocities."""
     mesh, hinges = problem.mesh, problem.mesh.hinges
     gather = _gathered(hinges.nodes, len(mesh.nodes))
     stiffness, damping = problem.hinge_stiffness, problem.sheet.damping
@@ -139,7 +142,7 @@ def _hinges(problem: Problem, chosen: Choices) -> Callable[[Array, Array], Array
             axis=1,
         )
         turning = (gradient * v[hinges.nodes]).sum((1, 2))
-        moment = np.sin(angle) if chosen.chord else angle  # of the energies K (2 sin(θ/2))²/2 and K θ²/2
+        moment = np.sin(angle) if chosen.chord else angle  # from the energies K (2 sin(θ/2))²/2 and K θ²/2
         put = -(stiffness * (moment + damping * turning))[:, None, None] * gradient
         return np.asarray(gather @ put.reshape(-1, 3))
 
@@ -147,7 +150,7 @@ def _hinges(problem: Problem, chosen: Choices) -> Callable[[Array, Array], Array
 
 
 def _table(problem: Problem) -> Callable[[Array, Array], Array]:
-    """This simulator's barrier and friction under each node."""
+    """Return the contact and friction force of the table on the nodes, as in DiffCloud's simulator."""
     if problem.table is None:
         return lambda x, v: np.zeros_like(x)
     settings = ContactSettings()

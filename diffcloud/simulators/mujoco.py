@@ -1,4 +1,4 @@
-"""Simulate problems in MuJoCo: the cloth is a two-dimensional flex, and each node is a body that slides along three axes.
+"""Simulate problems in MuJoCo. The cloth is a 2D flex, in which each node is a body with three slide joints.
 
 MuJoCo's membrane is Saint Venant-Kirchhoff, as is that of DiffCloud's simulator, and its damping multiplies the strain
 rate. MuJoCo takes the membrane and the bending stiffness from one Young's modulus E and one thickness h.
@@ -20,40 +20,40 @@ import numpy as np
 from diffcloud.simulators.problem import REST_HEIGHT, Problem, Sheet, Track
 
 _HOLDING_MASS = 1e3
-"""[kg] Of a held node: what is prescribed to it stays so within a step."""
+"""Mass of a held node [kg], so large that forces hardly change its prescribed velocity within a step."""
 _SHORTEST, _LONGEST = 2e-5, 5e-4
-"""[s] Steps of an exported cloth: damping that would need shorter ones is reduced; longer ones are bad for
+"""Limits of the time step of an exported cloth [s]. Damping that needs shorter steps is reduced. Longer steps degrade
 contact."""
 
 
 @dataclass(frozen=True)
 class Settings:
-    """What one sets in MuJoCo besides the problem."""
+    """MuJoCo settings that are not part of the problem."""
 
     step: float = 2e-4
-    """[s] Damping is explicit, so what a step may be falls with the square of the mesh size."""
+    """Time step [s]. Damping is explicit, so the largest stable step is proportional to the square of the mesh size."""
     cone: str = "elliptic"
     impratio: float = 10.0
-    """How much stiffer friction is than the contact itself."""
+    """Ratio of friction stiffness to contact stiffness."""
     contact_time: float = 0.002
     """Time constant of contacts [s], at least two steps."""
     radius: float = REST_HEIGHT
-    """Of the nodes [m]."""
+    """Radius of the nodes [m]."""
     solid: bool = False
-    """Whether the thickness is that of a solid sheet with the same E h and B, h² = 12 B/(E h), else as above."""
+    """True: thickness of a solid sheet with the same E h and B, h² = 12 B/(E h). False: as in the module docstring."""
     holding_mass: float = _HOLDING_MASS
 
 
 def thickness(sheet: Sheet, *, solid: bool = False) -> float:
-    """That MuJoCo is given [m]."""
+    """Thickness h for MuJoCo [m]."""
     return float(np.sqrt((12 if solid else 15 * (1 - sheet.poisson**2)) * sheet.bending / sheet.stretching))
 
 
 def stable(problem: Problem) -> tuple[Settings, Sheet]:
-    """Settings whose steps are short enough, and the sheet with the damping that these bear.
+    """Return settings with a stable time step, and the sheet with damping reduced if necessary.
 
-    Explicit steps Δt are stable below Δt² ω² + 2 d ω² Δt = 4. The highest frequency ω of a triangle of height a is about
-    ω² = 4 E h/((1 - ν²) σ a²) in its plane and 16 B/(σ a⁴) across; steps are half as long as that allows.
+    Explicit steps Δt are stable for Δt² ω² + 2 d ω² Δt < 4. The highest frequency ω of a triangle of height a is about
+    ω² = 4 E h/((1 - ν²) σ a²) for in-plane motion and 16 B/(σ a⁴) for bending. Steps are half the stable length.
     """
     sheet, height = problem.sheet, problem.mesh.smallest_height
     plane = 4 * sheet.stretching / ((1 - sheet.poisson**2) * sheet.density * height**2)
@@ -67,7 +67,7 @@ def stable(problem: Problem) -> tuple[Settings, Sheet]:
 
 
 def simulate(problem: Problem, settings: Settings | None = None) -> Track:
-    """The motion in steps of constant length."""
+    """Simulate a problem with constant time steps."""
     import mujoco
 
     from diffcloud.simulators.scripts import run_mujoco
@@ -84,11 +84,13 @@ def simulate(problem: Problem, settings: Settings | None = None) -> Track:
 
 
 def model_file(problem: Problem, settings: Settings | None = None, *, header: str = "") -> str:
-    """The problem in MuJoCo's XML (MJCF). Each node is a body that slides along three axes; a held one is so heavy, and
-    does not fall, that it stays where a step puts it.
+    """Return the problem as MuJoCo XML (MJCF).
+
+    Each node is a body with three slide joints. Held nodes have a large mass and no gravity, so that they keep the
+    position that each step prescribes.
 
     Args:
-        header: at the head of the file.
+        header: comment at the start of the file.
     """
     chosen, sheet = settings or Settings(), problem.sheet
     step = 1 / (problem.rate * problem.steps_of(chosen.step))
@@ -96,7 +98,7 @@ def model_file(problem: Problem, settings: Settings | None = None, *, header: st
     contact, itself = (
         {"friction": f"{friction:.9g} 0 0", "solref": f"{chosen.contact_time:.9g} 1"} for friction in problem.frictions
     )
-    surface_of: dict[str, Any] = {**contact, "priority": "1"}  # so that the cloth's own friction is that with itself
+    surface_of: dict[str, Any] = {**contact, "priority": "1"}  # so that the flex's own friction is only self-friction
     root = Element("mujoco", model=problem.name)
     if header:
         root.append(Comment(header))

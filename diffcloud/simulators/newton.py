@@ -1,7 +1,7 @@
-"""Problems in Newton: its vertex block descent (VBD), and the explicit solver that it differentiates.
+"""Simulate problems in Newton with vertex block descent (VBD), or with its differentiable explicit solver.
 
-Both have a stable neo-Hookean membrane, which is this simulator's at small strain. Hinges have the energies of this
-simulator's after a conversion. `scripts/run_newton.py` builds the model, here and beside an exported cloth.
+Both have a stable neo-Hookean membrane, which agrees with DiffCloud's at small strain. Hinge stiffnesses are converted,
+so that the bending energies agree. `scripts/run_newton.py` builds the model, both here and for an exported cloth.
 """
 
 from __future__ import annotations
@@ -20,20 +20,20 @@ Solver = Literal["vbd", "semi_implicit"]
 
 @dataclass(frozen=True)
 class Settings:
-    """What one sets in Newton besides the problem."""
+    """Newton settings that are not part of the problem."""
 
     solver: Solver = "vbd"
     step: float = 1 / 1200
-    """[s]"""
+    """Time step [s]."""
     iterations: int = 10
-    """Sweeps of a step of VBD."""
+    """Number of VBD iterations per step."""
 
 
 EXPLICIT = Settings("semi_implicit", step=2e-4)
 
 
 def simulate(problem: Problem, settings: Settings | None = None) -> Track:
-    """The motion in steps of constant length, in single precision on the processor."""
+    """Simulate a problem with constant time steps, in single precision on the CPU."""
     script, _ = _modules()
     chosen, cloth = settings or Settings(), problem.arrays()
     explicit = chosen.solver == "semi_implicit"
@@ -42,14 +42,14 @@ def simulate(problem: Problem, settings: Settings | None = None) -> Track:
     count = problem.steps_of(chosen.step)
     step, total = 1 / (problem.rate * count), (len(problem.times) - 1) * count
     wanted = problem.held_at(np.arange(total + 1) * step)
-    list(script.frames(model, solver, cloth, wanted[:2], step, 1))  # kernels are compiled before the motion is timed
+    list(script.frames(model, solver, cloth, wanted[:2], step, 1))  # compile kernels before the time measurement
     began = time.process_time()
     frames = list(script.frames(model, solver, cloth, wanted, step, count))
     return Track(np.array(frames), time.process_time() - began)
 
 
 def mean_height(problem: Problem, stretching: float = 1.0) -> tuple[float, float, float, float]:
-    """As `ours.mean_height`, by the explicit solver, of a problem without table whose held nodes stay."""
+    """As `ours.mean_height`, with the explicit solver. The problem must have no table and fixed held nodes."""
     script, warp = _modules()
     cloth = problem.arrays()
     model = script.build(cloth, explicit=True, gradient=True)
@@ -58,7 +58,7 @@ def mean_height(problem: Problem, stretching: float = 1.0) -> tuple[float, float
     count = problem.steps_of(EXPLICIT.step)
     step, total = 1 / (problem.rate * count), (len(problem.times) - 1) * count
     states, control = [model.state() for _ in range(total + 1)], model.control()
-    for number in range(2):  # the first time kernels are compiled
+    for number in range(2):  # the first iteration compiles the kernels
         began = time.process_time()
         with warp.Tape() as tape:
             for before, after in pairwise(states):

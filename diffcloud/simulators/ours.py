@@ -1,4 +1,4 @@
-"""Problems in this simulator."""
+"""Simulate problems in DiffCloud's own simulator."""
 
 from __future__ import annotations
 
@@ -16,13 +16,14 @@ from diffcloud.sim.surrounding import Order, Surrounding
 from diffcloud.simulators.problem import Problem, Track
 
 STEPS = 16
-"""A frame."""
+"""Number of time steps per frame."""
 _SETTLING_PART, _SETTLING_STEPS = 1 / 25, 400
-"""Of the time that others need, and how many: so long steps of backward Euler bring a cloth to rest by themselves."""
+"""For problems that settle: fraction of the problem's duration per step, and number of steps. Backward Euler with such
+long steps damps the motion by itself."""
 
 
 def scene(problem: Problem, order: Order = 2) -> Scene:
-    """The problem as a scene with implicit steps."""
+    """Convert a problem to a scene with implicit time steps."""
     sheet = problem.sheet
     table = () if problem.table is None else (rectangle_surface((0.0, 0.0), (10.0, 10.0), problem.table),)
     return Scene(
@@ -53,7 +54,7 @@ def scene(problem: Problem, order: Order = 2) -> Scene:
 
 
 def simulate(problem: Problem, *, steps: int = STEPS, order: Order = 2) -> Track:
-    """The motion with so many steps a frame; of a problem that settles, its start and its rest."""
+    """Simulate with `steps` time steps per frame. For a problem that settles, return only start and rest state."""
     described = replace(scene(problem, order), frame_steps=steps)
     count = (len(problem.times) - 1) * steps
     if problem.settling:
@@ -63,22 +64,22 @@ def simulate(problem: Problem, *, steps: int = STEPS, order: Order = 2) -> Track
         )
     system, _ = described.build()
     with torch.no_grad():
-        rollout(system, 1)  # kernels are loaded before the motion is timed
+        rollout(system, 1)  # load kernels before the time measurement
         began = time.process_time()
         nodes = rollout(system, count).positions[0].numpy()
     return Track(nodes[:: count if problem.settling else steps], time.process_time() - began)
 
 
 def mean_height(problem: Problem, stretching: float = 1.0, *, steps: int = STEPS) -> tuple[float, float, float, float]:
-    """(mean height of the nodes at the end [m], its derivative by the logarithm of E h [m], seconds forward, backward).
+    """Return mean final node height [m], its derivative by log(E h) [m], and forward and backward time [s].
 
     Args:
-        stretching: a factor on E h.
+        stretching: factor on E h.
     """
     system, _ = replace(scene(problem), frame_steps=steps).build()
     factor = torch.tensor(stretching, dtype=torch.float64, requires_grad=True)
     properties = replace(system.properties, stretching=system.properties.stretching * factor)
-    rollout(system, 1, properties=properties).positions.sum().backward()  # kernels are loaded before they are timed
+    rollout(system, 1, properties=properties).positions.sum().backward()  # load kernels before the time measurement
     properties = replace(system.properties, stretching=system.properties.stretching * factor)
     began = time.process_time()
     height = rollout(system, (len(problem.times) - 1) * steps, properties=properties).positions[0, -1, :, 2].mean()

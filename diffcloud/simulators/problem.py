@@ -1,4 +1,4 @@
-"""What every simulator is given: a problem in SI units and in no simulator's own terms."""
+"""Definition of a test problem in SI units, independent of the conventions of any simulator."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from diffcloud.sim.materials import TABLE_ENTRY_TO_BENDING
 from diffcloud.sim.motion import Motion
 
 REST_HEIGHT = 0.0021
-"""Of nodes that lie on a table [m]: where this simulator's contact bears a light cloth. The others get it as a radius."""
+"""Height of nodes at rest on a table [m] in DiffCloud, for a light cloth. Others use it as node radius."""
 
 _MOTION_RATE = 480
-"""[1/s] At which motions of held nodes are sampled for scripts, which interpolate linearly."""
+"""Sampling rate of held-node motions for the scripts, which interpolate linearly [1/s]."""
 
 
 @dataclass(frozen=True)
@@ -29,14 +29,14 @@ class Sheet:
     """An isotropic elastic sheet."""
 
     density: float
-    """[kg/m²]"""
+    """Mass per area [kg/m²]."""
     stretching: float
-    """E h: force per width per strain of a strip whose sides are free [N/m]."""
+    """E h: force per width per strain of a strip with free sides [N/m]."""
     poisson: float
     bending: float
-    """B: bending stiffness per width of a strip whose sides are free [N·m]."""
+    """B: bending stiffness per width of a strip with free sides [N·m]."""
     damping: float
-    """Proportional to the stiffness [s]."""
+    """Coefficient of stiffness-proportional damping [s]."""
 
     @property
     def shear(self) -> float:
@@ -51,60 +51,60 @@ class Sheet:
 
 @dataclass(frozen=True)
 class Problem:
-    """A cloth, what holds it, and perhaps a table under it. Nothing drags at it but `settling`."""
+    """A cloth, its held nodes, and optional obstacles. The only external damping is `settling`."""
 
     name: str
     mesh: ClothMesh
     sheet: Sheet
     seconds: float
     held: Mapping[int, Motion | None]
-    """Node -> how it is moved; None: it stays."""
+    """Held node -> its motion. None: fixed."""
     table: float | None = None
-    """Its height [m]."""
+    """Height of the table [m]. None: no table."""
     friction: float = 0.3
-    """Of the cloth with the table and what else it meets."""
+    """Friction coefficient between cloth and obstacles."""
     self_friction: float | None = None
-    """Of the cloth with itself; None: the same."""
+    """Friction coefficient of the cloth with itself. None: same as `friction`."""
     self_contact: bool = False
     bodies: tuple[SurfaceMesh, ...] = ()
-    """What the cloth meets beside the table, standing still."""
+    """Static obstacles besides the table."""
     shaped: bool = False
-    """Whether its hinges are at rest as the mesh stands, not flat."""
+    """True: hinges are at rest in the shape of the mesh. False: the rest shape is flat."""
     gravity: float = 9.81
-    """Downwards [m/s²]."""
+    """Gravity, downwards [m/s²]."""
     settling: float = 0.0
-    """Drag that brings a cloth to rest, where only its rest is looked at: force per momentum [1/s]."""
+    """Drag coefficient, force per momentum [1/s]. It brings the cloth to rest if only the rest state matters."""
     rate: float = 20.0
-    """Frames a second that are compared."""
+    """Frame rate of the comparison [1/s]."""
 
     @property
     def frictions(self) -> tuple[float, float]:
-        """(with the table and bodies, of the cloth with itself)"""
+        """Friction coefficients: (with obstacles, of the cloth with itself)."""
         return self.friction, self.friction if self.self_friction is None else self.self_friction
 
     @property
     def times(self) -> NDArray[np.float64]:
-        """[T] of the frames, from 0 [s]."""
+        """[T] frame times, from 0 [s]."""
         return np.arange(round(self.seconds * self.rate) + 1) / self.rate
 
     @property
     def node_mass(self) -> NDArray[np.float64]:
-        """[V] a third of the faces around each node [kg]."""
+        """[V] lumped masses: a third of the adjacent faces [kg]."""
         return self.sheet.density * self.mesh.node_area
 
     @property
     def hinge_stiffness(self) -> NDArray[np.float64]:
-        """[H] K of the hinge energy K θ²/2 with which a free strip of this mesh bends as the sheet does [N·m]."""
+        """[H] hinge stiffness K (energy K θ²/2) with which a free strip of this mesh bends like the sheet [N·m]."""
         hinges = self.mesh.hinges
         area = self.mesh.face_area[hinges.faces].sum(axis=1)
         return np.asarray(self.sheet.bending / TABLE_ENTRY_TO_BENDING * hinges.length**2 / (4 * area))
 
     def steps_of(self, step: float) -> int:
-        """How many steps of about so many seconds make a frame."""
+        """Return the number of steps per frame for a time step of about `step` seconds."""
         return max(1, round(1 / (self.rate * step)))
 
     def held_at(self, times: NDArray[np.floating]) -> NDArray[np.float64]:
-        """[S, K, 3] where the held nodes are at times [S], in the order of `held` [m]."""
+        """[S, K, 3] positions of the held nodes at times [S], in the order of `held` [m]."""
         places = []
         for node, motion in self.held.items():
             start = np.broadcast_to(self.mesh.nodes[node], (len(times), 3))
@@ -112,7 +112,7 @@ class Problem:
         return np.stack(places, axis=1)
 
     def arrays(self) -> dict[str, Any]:
-        """All of it as numbers, for the scripts that run it without this package."""
+        """Return the problem as arrays and numbers, for scripts that run without this package."""
         mesh, sheet, hinges = self.mesh, self.sheet, self.mesh.hinges
         bodies = SurfaceMesh.joined(self.bodies)
         motion_times = np.linspace(0.0, self.times[-1], math.ceil(self.times[-1] * _MOTION_RATE) + 1)
@@ -146,16 +146,16 @@ class Problem:
 
 @dataclass(frozen=True)
 class Track:
-    """What a simulator makes of a problem."""
+    """Result of a simulation."""
 
     nodes: NDArray[np.float64]
-    """[T, V, 3] at the problem's times [m]."""
+    """[T, V, 3] node positions at the problem's frame times [m]."""
     seconds: float
-    """Of processor time, without building and compiling."""
+    """CPU time of the simulation [s], without model building and compilation."""
 
 
 def distances(a: Track, b: Track) -> NDArray[np.float64]:
-    """[T] RMS distance over nodes [m]."""
+    """[T] RMS distance over the nodes [m]."""
     return np.asarray(np.sqrt(((a.nodes - b.nodes) ** 2).sum(-1).mean(-1)))
 
 
@@ -164,10 +164,10 @@ _MODULES = {"mujoco": "mujoco", "newton": "newton", "warp-lang": "warp"}
 
 
 def installed() -> dict[str, str]:
-    """The other simulators' packages and their versions.
+    """Return package -> version of the other simulators.
 
     Raises:
-        ConfigError: one is missing; the message says how to install it.
+        ConfigError: a package is missing. The message explains how to install it.
     """
     missing = [name for name in PACKAGES if importlib.util.find_spec(_MODULES[name]) is None]
     if missing:

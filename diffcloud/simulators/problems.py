@@ -1,4 +1,4 @@
-"""Two tests whose answers are known."""
+"""Two test problems with analytical solutions: stretching of a hanging strip, and bending of a cantilever."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from diffcloud.simulators.problem import Problem, Sheet, Track
 
 @dataclass(frozen=True)
 class Known:
-    """A test with a known answer."""
+    """A test problem with its analytical solution."""
 
     problem: Problem
     measures: Callable[[Track], dict[str, float]]
-    """Name -> what a simulator makes of it."""
+    """Function that measures the compared quantities (name -> value) in a simulation result."""
     theory: dict[str, float]
 
 
@@ -27,18 +27,18 @@ _STRIP = Sheet(density=0.2, stretching=500.0, poisson=0.3, bending=1e-6, damping
 _LENGTH = 0.5
 _ROWS, _ACROSS = 17, 4
 _CLEAR = 12
-"""Row up to which the held upper end does not show."""
+"""Grid row above which the clamped upper end affects the strain."""
 _ELONGATION = 0.00073575
-"""Mean strain of the clear part: that of `_STRIP` on Earth, small enough for linear theory."""
+"""Mean strain below this row: that of `_STRIP` under Earth's gravity, small enough for linear theory."""
 _LITTLE = 0.01
-"""Poisson's ratio below which the contraction is not looked at."""
+"""Poisson's ratio below which the lateral contraction is not measured."""
 
 
 def strip(sheet: Sheet = _STRIP) -> Known:
-    """A strip hangs from its upper end: how its lower three quarters stretch, and how it contracts across them.
+    """Hanging strip: longitudinal strain and lateral contraction of its lower three quarters.
 
     Args:
-        sheet: hangs under a gravity that stretches it by so little as theory allows; its damping is left out.
+        sheet: material of the strip. Gravity is scaled such that linear theory is valid. Its damping is ignored.
     """
     sheet = replace(sheet, damping=0.0)
     flat = grid_cloth(_ROWS, _ACROSS, _LENGTH, 0.1)
@@ -46,7 +46,7 @@ def strip(sheet: Sheet = _STRIP) -> Known:
     held: dict[int, Motion | None] = dict.fromkeys(range((_ROWS - 1) * _ACROSS, _ROWS * _ACROSS))
     clear = _LENGTH * _CLEAR / (_ROWS - 1)
     gravity = _ELONGATION * 2 * sheet.stretching / (sheet.density * clear)
-    passage = _LENGTH / math.sqrt(sheet.stretching / sheet.density)  # of a wave along the strip
+    passage = _LENGTH / math.sqrt(sheet.stretching / sheet.density)  # travel time of a wave along the strip
     problem = Problem(
         "strip",
         replace(flat, nodes=upright),
@@ -74,15 +74,15 @@ def strip(sheet: Sheet = _STRIP) -> Known:
 _BEAM = Sheet(density=0.2, stretching=200.0, poisson=0.0, bending=1e-4, damping=0.0)
 _GAMMA = 5.0
 _SLENDER = 2e4
-"""E h L²/B: so long a strip that it bends and does not stretch."""
+"""E h L²/B of the strip, so large that it bends but hardly stretches."""
 
 
 def cantilever(sheet: Sheet = _BEAM, cells: int = 24) -> Known:
-    """A strip clamped level at one end bends far under its weight, the heavy elastica: drop and reach of its free end.
+    """Horizontal cantilever strip that bends far under its weight (heavy elastica): drop and reach of its free end.
 
     Args:
-        sheet: whose stiffnesses decide how long the strip is, and how heavy; its damping is left out.
-        cells: along the free length, and half a cell more, in whose middle the clamp ends.
+        sheet: material, which determines length and gravity. Its damping is ignored.
+        cells: number of cells along the free length. The clamp ends in the middle of a further cell.
     """
     sheet = replace(sheet, damping=0.0)
     length = math.sqrt(_SLENDER * sheet.bending / sheet.stretching)
@@ -90,10 +90,10 @@ def cantilever(sheet: Sheet = _BEAM, cells: int = 24) -> Known:
     columns = cells + 2
     mesh = grid_cloth(3, columns, 2 * side, side * (columns - 1), through=1)
     gravity = _GAMMA * sheet.bending / (sheet.density * length**3)
-    sway = length**2 * math.sqrt(sheet.density / sheet.bending)  # by which bending vibrations are measured
+    sway = length**2 * math.sqrt(sheet.density / sheet.bending)  # time scale of bending vibrations
     held: dict[int, Motion | None] = {row * columns + column: None for row in range(3) for column in (0, 1)}
     problem = Problem("cantilever", mesh, sheet, 3.4 * sway, held, gravity=gravity, settling=7 / sway, rate=9 / sway)
-    root = float(mesh.nodes[1, 0]) - side / 2  # the second held row's hinges bend over half a cell to either side
+    root = float(mesh.nodes[1, 0]) - side / 2  # hinges of the second held row bend over half a cell on each side
 
     def measures(track: Track) -> dict[str, float]:
         tip = track.nodes[-1].reshape(3, columns, 3)[:, -1].mean(axis=0)
@@ -104,9 +104,10 @@ def cantilever(sheet: Sheet = _BEAM, cells: int = 24) -> Known:
 
 
 def elastica(gamma: float) -> tuple[float, float]:
-    """(drop, reach) of the free end of a heavy clamped strip, in parts of its length.
+    """Return (drop, reach) of the free end of a heavy clamped strip, as fractions of its length.
 
-    The slope φ below the level obeys φ'' = -Γ (1 - s) cos φ, φ(0) = 0, φ'(1) = 0, with Γ = σ g L³/B and s along the strip.
+    The slope φ below the horizontal obeys φ'' = -Γ (1 - s) cos φ with φ(0) = 0 and φ'(1) = 0. Here Γ = σ g L³/B, and s
+    is the position along the strip.
     """
     from scipy.integrate import solve_bvp  # slow to import
 

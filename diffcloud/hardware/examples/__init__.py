@@ -1,5 +1,5 @@
-"""Drivers to read and to try: a simulated arm of another make, and a camera that is a folder being written.
+"""Example drivers: a simulated UR5e arm, and a camera that reads images from a folder.
 
-Both keep the protocols of `diffcloud.hardware.devices`, are named by `arm_driver` and `camera_driver` in
-rig.yaml, and pass the conformance tests (docs/drivers.md).
+Both implement the protocols of `diffcloud.hardware.devices` and pass the conformance tests (docs/drivers.md). Select them
+with `arm_driver` and `camera_driver` in rig.yaml.
 """

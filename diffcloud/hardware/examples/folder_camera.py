@@ -1,8 +1,8 @@
-"""A camera that is a folder being written: another program stores images there, and they are recorded as they appear.
+"""A camera driver that reads images which another program writes into a folder.
 
 <folder>/camera.json     as in raw episodes: intrinsics, depth_scale_m
-<folder>/depth/*.png     16-bit, numbered; written under another name and renamed, or written at once
-<folder>/color/*.png     optional, of the same names, and there before the depth image
+<folder>/depth/*.png     16-bit, numbered; best written under another name and then renamed
+<folder>/color/*.png     optional, with the same names, written before the depth image
 
 In rig.yaml: `camera_driver: diffcloud.hardware.examples.folder_camera:FolderCamera` and `cameras: {side: /data/side}`.
 """
@@ -22,15 +22,15 @@ from diffcloud.io.raw_episodes import CameraInfo, read_camera_info
 
 _LOOK_S = 0.005
 _SETTLED_S = 1.0
-"""An image that cannot be read for so long is damaged, and not only half-written."""
+"""Time after which an unreadable image is considered damaged. Before, it may still be being written."""
 
 
 class FolderCamera:
-    """A driver: keeps the protocol `devices.Camera`.
+    """A camera driver that implements `devices.Camera`.
 
     Args:
-        name: of the camera in the episode.
-        serial: the folder.
+        name: name of the camera in the episode.
+        serial: path of the folder.
     """
 
     def __init__(self, name: str, serial: str, **_: Any) -> None:
@@ -42,7 +42,7 @@ class FolderCamera:
             info = read_camera_info(self._folder / "camera.json")
         except EpisodeError as error:
             raise HardwareError(f"Camera {self.name}: {error}") from error
-        self._seen = {path.name for path in self._images()}  # what was there before is no frame of this recording
+        self._seen = {path.name for path in self._images()}  # ignore images from before the recording
         return replace(info, name=self.name)
 
     def read(self, timeout_s: float) -> CameraFrame:
@@ -73,4 +73,4 @@ class FolderCamera:
             except EpisodeError as error:
                 if time.monotonic() > end:
                     raise HardwareError(f"Camera {self.name}: {error}") from error
-                time.sleep(_LOOK_S)  # it is still being written
+                time.sleep(_LOOK_S)  # the image may still be being written

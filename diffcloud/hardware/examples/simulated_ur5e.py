@@ -1,12 +1,12 @@
-"""A simulated UR5e behind a socket, and the driver for it: what a driver for an arm of your own looks like.
+"""A simulated UR5e arm with a network interface, and its driver, as an example for your own driver.
 
     python -m diffcloud.hardware.examples.simulated_ur5e --port 5005
     diffcloud data capture --rig rig.yaml ...
 
 rig.yaml holds `arm_driver: diffcloud.hardware.examples.simulated_ur5e:SimulatedUR5e` and `arm: 127.0.0.1:5005`.
 
-The controller stands for the arm's own computer. It moves the joints 125 times a second, and stops them by itself when it
-has heard nothing for half a second: the last resort where a process or a cable is lost, which any real arm needs too.
+The controller represents the arm's own computer. It moves the joints 125 times a second, and stops them if it receives
+nothing for half a second. Any real arm needs such a timeout too, in case a process dies or a cable breaks.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from diffcloud.sensing.robot import Robot
 Floats = NDArray[np.float64]
 
 HOME_RAD = np.deg2rad([0.0, -90.0, 90.0, -90.0, -90.0, 0.0])
-"""The tool looks down, 0.49 m in front of the base and 0.36 m above it."""
+"""Home pose: the tool points down, 0.49 m in front of the base and 0.36 m above it."""
 _TICK_S = 0.008
 _SILENCE_S = 0.5
 _CALL_TIMEOUT_S = 0.4
@@ -40,13 +40,13 @@ _LAG_S = 0.02
 
 
 def ur5e() -> Robot:
-    """The description that goes with it."""
+    """Return the robot description of the simulated arm."""
     with as_file(files(__package__) / "ur5e.urdf") as path:
         return Robot.from_urdf(path)
 
 
 class Controller:
-    """The arm and its own computer; `serve` answers one request a line, in JSON."""
+    """The simulated arm with its controller. `serve` answers JSON requests, one per line."""
 
     def __init__(self, joints_rad: Floats = HOME_RAD) -> None:
         self._robot, self._lock = ur5e(), threading.RLock()
@@ -58,7 +58,7 @@ class Controller:
         self._ending = threading.Event()
 
     def serve(self, port: int = 0) -> socketserver.ThreadingTCPServer:
-        """Start; the server's `server_address` tells the port, its `shutdown` ends it."""
+        """Start a server. Its `server_address` has the port, and its `shutdown` stops it."""
         controller = self
 
         class Link(socketserver.StreamRequestHandler):
@@ -77,7 +77,7 @@ class Controller:
 
     @property
     def tool_position(self) -> Floats:
-        """[3] now [m]."""
+        """[3] current tool position [m]."""
         with self._lock:
             return np.array(self._robot.tool_pose(self._joints)[:3, 3])
 
@@ -88,7 +88,7 @@ class Controller:
                 self._heard = time.monotonic()
                 value = getattr(self, f"_call_{told['call']}")(*told.get("arguments", ()))
             return json.dumps({"value": value}).encode()
-        except Exception as error:  # an arm's computer goes on, whatever it is asked
+        except Exception as error:  # the controller must survive any request
             return json.dumps({"error": f"{type(error).__name__}: {error}"}).encode()
 
     def _move(self) -> None:
@@ -96,7 +96,7 @@ class Controller:
         while not self._ending.wait(_TICK_S):
             with self._lock:
                 now = time.monotonic()
-                step, last = min(now - last, 0.1), now  # what has passed: a busy computer is late
+                step, last = min(now - last, 0.1), now  # elapsed time, since a busy computer may be late
                 if now - self._heard > _SILENCE_S:
                     self._call_stop()
                 wanted = self._joint_velocity
@@ -150,20 +150,20 @@ class Controller:
 
 
 class SimulatedUR5e:
-    """A driver: keeps the protocol `devices.Arm`.
+    """An arm driver that implements `devices.Arm`.
 
     Args:
         address: HOST:PORT of the controller.
 
     Raises:
-        HardwareError: nothing answers there.
+        HardwareError: no controller answers at the address.
     """
 
     joint_count = 6
 
     def __init__(self, address: str) -> None:
         self.address = address
-        # Stop goes over a link of its own: it must not wait for the answer to another call
+        # Stop uses its own connection, so that it never waits for the answer to another call.
         self._calls, self._stops = _Link(address), _Link(address)
 
     def describe(self) -> dict[str, Any]:
@@ -209,7 +209,7 @@ class SimulatedUR5e:
 
 
 class _Link:
-    """One request at a time over one socket."""
+    """A socket that handles one request at a time."""
 
     def __init__(self, address: str) -> None:
         host, _, port = address.rpartition(":")

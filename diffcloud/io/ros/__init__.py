@@ -1,1 +1,1 @@
-"""Recordings of ROS, without ROS."""
+"""Read ROS recordings without a ROS installation."""

@@ -1,7 +1,7 @@
-"""Times of messages whose stamps are missing.
+"""Times of ROS messages, including messages without a time stamp.
 
-A stamp of 0 means two things. In a simulator's recording it is the start of simulated time. Elsewhere nobody stamped the
-message. Then the time at which the recorder received it is taken, moved to the clock of the stamped messages.
+In a simulator's recording, stamp 0 is the start of simulated time. Elsewhere it means that the message was not stamped.
+Then the time at which the recorder received the message is used, converted to the clock of the stamped messages.
 """
 
 from __future__ import annotations
@@ -16,14 +16,14 @@ from diffcloud.io.recordings import EPOCH_S
 Floats = NDArray[np.float64]
 
 _OTHER_CLOCK_S = 60.0
-"""Stamps that differ from the times of arrival by more are of another clock, such as simulated time. Delays are shorter."""
+"""Largest delay between stamp and arrival. A larger difference means another clock, such as simulated time."""
 
 
 def message_times(stamps: Mapping[str, Sequence[tuple[float, float]]]) -> tuple[dict[str, Floats], list[str]]:
-    """(topic -> times [N] of its messages [s], warnings about those that have no stamp).
+    """Return (topic -> times [N] of its messages [s], warnings about messages without a stamp).
 
     Args:
-        stamps: topic -> (stamp, arrival) of each message in order of arrival [s]; a stamp of 0 or less is none.
+        stamps: topic -> (stamp, arrival) of each message in order of arrival [s]. A stamp of 0 or less means none.
     """
     pairs = {topic: np.array(held, dtype=np.float64).reshape(-1, 2) for topic, held in stamps.items()}
     every = np.concatenate([np.zeros((0, 2)), *pairs.values()])

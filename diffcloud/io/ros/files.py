@@ -1,8 +1,8 @@
-"""Opening ROS recordings: one file, the parts of a split one, or a rosbag2 folder.
+"""Open ROS recordings: a file, the parts of a split recording, or a rosbag2 folder.
 
-Recorders split long recordings into files `name_0`, `name_1`, ... One of them is a recording that starts or ends in the
-middle, and often one without the transforms, which are sent once. rosbag2 lists the parts in metadata.yaml. rosbag1 only
-numbers them, as people number their takes: there the parts are those whose times adjoin.
+Recorders split long recordings into files `name_0`, `name_1`, ... A single part is incomplete, and often lacks the
+transforms, which are sent only once. rosbag2 lists the parts in metadata.yaml. rosbag1 only numbers them, but users
+number separate takes in the same manner. There, files are parts of one recording if their times adjoin.
 """
 
 from __future__ import annotations
@@ -24,17 +24,18 @@ from diffcloud.io.ros.topics import is_depth
 _METADATA = "metadata.yaml"
 _NUMBERED = re.compile(r"(.*)_(\d+)")
 _DATE = re.compile(r"_?\d{4}-\d{2}-\d{2}-\d{2}-\d{2}-\d{2}")
-"""rosbag1 writes into each part's name when that part was begun."""
+"""Start time that rosbag1 adds to the name of each part."""
 _ADJOINING_S = 5.0
-"""Parts follow each other at once, but may begin with a slow topic; between two takes somebody lays the cloth out again."""
+"""Largest gap between parts. They adjoin closely, but may start with a slow topic. Between takes, the cloth must
+be spread again, which takes longer."""
 
 
 @contextmanager
 def opened(paths: Sequence[Path]) -> Iterator[Any]:
-    """A reader (`rosbags.highlevel.AnyReader`) of all files together, messages in order of their arrival.
+    """Yield a reader (`rosbags.highlevel.AnyReader`) of all files together, with messages in order of arrival.
 
     Raises:
-        EpisodeError: missing, or not a readable recording, also where damage is only met later, while it is read.
+        EpisodeError: a file is missing or damaged. This includes damage that is found later, inside the block.
     """
     from rosbags.highlevel import AnyReader
     from rosbags.typesys import Stores, get_typestore
@@ -43,13 +44,13 @@ def opened(paths: Sequence[Path]) -> Iterator[Any]:
     for path in paths:
         if Path(path).exists() and not Path(path).is_dir():
             check_input(path, kind="recording", error=EpisodeError, most_bytes=sys.maxsize)
-    # bags of rosbag2 before 2023 carry no message definitions; those of Humble serve
+    # rosbag2 recordings before 2023 have no message definitions. Those of ROS Humble are compatible.
     try:
         reader = AnyReader([Path(path) for path in paths], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
         reader.open()
     except FileNotFoundError as error:
         raise EpisodeError(f"No such recording: {error}.") from error
-    except Exception as error:  # damaged files fail in many ways inside
+    except Exception as error:  # rosbags raises many types of errors on damaged files
         raise EpisodeError(f"{shown} is not a readable ROS recording ({type(error).__name__}: {error}).") from error
     try:
         yield reader
@@ -63,13 +64,13 @@ def opened(paths: Sequence[Path]) -> Iterator[Any]:
 
 
 def refuse_lone_parts(paths: Sequence[Path]) -> tuple[str, ...]:
-    """Refuse some parts of a split recording without the others.
+    """Check that no part of a split recording is missing.
 
     Returns:
-        Warnings: files that may be parts, and cannot be read.
+        Warnings about files that may be parts but are not readable.
 
     Raises:
-        EpisodeError: names the folder, or the files, to give instead.
+        EpisodeError: parts are missing. The message names the folder or files to use instead.
     """
     warnings: list[str] = []
     given = {Path(path).resolve() for path in paths}
@@ -98,21 +99,21 @@ def refuse_lone_parts(paths: Sequence[Path]) -> tuple[str, ...]:
 
 
 def _listed_beside(path: Path) -> list[str]:
-    """Names of the files of the rosbag2 recording in whose folder a file lies; empty without metadata.yaml."""
+    """List the files of the rosbag2 recording in the same folder as `path`. Empty without metadata.yaml."""
     try:
         data = yaml.safe_load((path.parent / _METADATA).read_text(encoding="utf-8"))
         return [PurePath(name).name for name in data["rosbag2_bagfile_information"]["relative_file_paths"]]
     except (OSError, UnicodeDecodeError, yaml.YAMLError, KeyError, TypeError):
-        return []  # a folder's own damage is reported when the folder is opened
+        return []  # a damaged metadata.yaml is reported when the folder itself is opened
 
 
 def _adjoining(path: Path) -> tuple[list[Path], list[Path]]:
-    """(parts of one recording in their order, `path` among them; unreadable files whose names would fit)."""
+    """Return the parts of the recording that `path` belongs to, in order, and unreadable files with matching names."""
     match = _NUMBERED.fullmatch(path.stem)
     if match is None:
         return [path], []
     number = int(match.group(2))
-    # numbered alike but for the date
+    # Files with the same name, except for the number and the date.
     beside = {
         int(found.group(2)): other
         for other in sorted(path.parent.iterdir())
@@ -138,7 +139,7 @@ def _adjoining(path: Path) -> tuple[list[Path], list[Path]]:
 
 @dataclass(frozen=True)
 class _Extent:
-    """What a file covers."""
+    """Time range [s] and depth topics of a file."""
 
     start_s: float
     end_s: float
@@ -146,11 +147,11 @@ class _Extent:
 
     def adjoins(self, other: _Extent) -> bool:
         near = self.start_s <= other.end_s + _ADJOINING_S and other.start_s <= self.end_s + _ADJOINING_S
-        return near and bool(self.depths & other.depths)  # cameras recorded side by side are no parts
+        return near and bool(self.depths & other.depths)  # simultaneous files of different cameras are not parts
 
 
 def _extent(path: Path) -> _Extent | None:
-    """None for a file that cannot be read."""
+    """Return the extent of a file, or None if it is not readable."""
     try:
         with opened([path]) as reader:
             depths = frozenset(held.topic for held in reader.connections if is_depth(held.topic, held.msgtype))

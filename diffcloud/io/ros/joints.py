@@ -1,4 +1,4 @@
-"""The joint log of a ROS recording: joint_states or else the links in tf, and the tool's pose from tf."""
+"""The joint log of a ROS recording, from joint_states or from the link frames in tf, with the tool pose from tf."""
 
 from __future__ import annotations
 
@@ -19,33 +19,34 @@ from diffcloud.io.ros.transforms import TransformTree
 from diffcloud.io.urdf import Joint, RobotDescription
 
 GRIPPER_JOINT, GRIPPER_CLOSED_RAD = "finger_joint", 0.8
-"""Of a Robotiq 2F-85, in its maker's description."""
+"""Joint and closed position of a Robotiq 2F-85 gripper, from the manufacturer's description."""
 _LATEST_S = 0.5
-"""As with images: a message that is older than one before it by more is of another clock."""
+"""Largest delay. A message that is older than its predecessor by more has another clock."""
 _OFF_M, _OFF_RAD = 0.005, np.deg2rad(1.0)
-"""How far a link in tf may lie from where the robot's description puts it."""
+"""Largest deviation of a link in tf from its pose in the robot description."""
 
 
 @dataclass(frozen=True)
 class Grip:
-    """Which joint tells how far a gripper is closed."""
+    """The joint that measures how far a gripper is closed."""
 
     joint: str | None
-    """None: the arm has no gripper."""
+    """Joint name, None if the arm has no gripper."""
     open: float
-    """Its position [rad or m]."""
+    """Position of the joint at which the gripper is open [rad or m]."""
     closed: float
     guessed: bool
-    """Whether nobody said when it is closed."""
+    """Whether `closed` is a default that the user did not confirm."""
 
     @staticmethod
     def of(joint: str | None, open_: float, closed: float | None) -> Grip:
-        """
+        """Build a grip from the user's options.
+
         Args:
-            closed: None takes that of a Robotiq 2F-85.
+            closed: None: that of a Robotiq 2F-85.
 
         Raises:
-            ConfigError: equal positions, or no numbers.
+            ConfigError: the positions are equal or not finite.
         """
         at = GRIPPER_CLOSED_RAD if closed is None else closed
         if not (math.isfinite(open_) and math.isfinite(at) and open_ != at):
@@ -58,7 +59,7 @@ class Grip:
 
     @property
     def warnings(self) -> list[str]:
-        """What is taken of its positions because nobody said it."""
+        """Warnings about assumed positions."""
         if self.joint == GRIPPER_JOINT or not self.guessed:
             return []
         return [
@@ -67,7 +68,7 @@ class Grip:
         ]
 
     def state(self, positions: NDArray[np.float64]) -> NDArray[np.float64]:
-        """0 open to 1 closed."""
+        """Convert joint positions to gripper states, from 0 (open) to 1 (closed)."""
         return (positions - self.open) / (self.closed - self.open)
 
 
@@ -82,17 +83,17 @@ def joint_log(
     grip: Grip,
     named: Collection[str] = (),
 ) -> tuple[RobotLog, tuple[str, ...]]:
-    """(rows in order of time, warnings about what stays unknown).
+    """Build the joint log from joint_states messages. Return it with warnings about unknown quantities.
 
     Args:
-        where: the recording, for messages.
-        sent: one or more, in order of arrival.
-        joint_names: of the arm, in order; None takes joint_1, joint_2, ...
-        named: topics that the user named, also as TOPIC#NUMBER (`publishers.of_one_driver`).
+        where: name of the recording, for messages.
+        sent: messages in order of arrival, at least one.
+        joint_names: joints of the arm in order. None: joint_1, joint_2, ...
+        named: topics that the user selected, also as TOPIC#NUMBER (`publishers.of_one_driver`).
 
     Raises:
-        EpisodeError: a joint of the arm, or the gripper's, is not in joint_states (lists those that are), the clock was
-            set back, or several publishers send the same joints and none of them is named.
+        EpisodeError: a joint is not in joint_states, the clock was set back, or several publishers send the same joints
+            and none of them is selected.
     """
     seen = {name for held in sent for name in held.message.name}
     if joint_names is None:
@@ -113,7 +114,7 @@ def joint_log(
     others = sorted(seen - set(joint_names))
     gripper_joint = grip.joint
     if gripper_joint is not None and gripper_joint in seen:
-        # often sent by another driver than the arm's joints, in messages of its own
+        # The gripper's joint is often published by another driver, in separate messages.
         times, values = _series(where, messages, [gripper_joint])
         gripper = grip.state(np.interp(rows, times, values[:, 0])) if len(times) else gripper
         warnings += grip.warnings
@@ -144,15 +145,16 @@ def log_from_links(
     tool_frame: str,
     grip: Grip,
 ) -> tuple[RobotLog, tuple[str, ...]]:
-    """The joint log of a recording without joint_states whose tf has the robot's links: each joint's angle is how far its
-    child is turned about its axis from its zero in the description.
+    """Build the joint log from the link frames in tf, for a recording without joint_states.
+
+    The angle of a joint is the rotation of its child link about the joint axis, relative to the robot description.
 
     Args:
-        description: of the robot, whose links are named as in tf.
+        description: robot description with the same link names as tf.
 
     Raises:
-        EpisodeError: the description has no such tool, tf lacks some of the links that carry it, none of them moves, or one
-            lies where the description's joint cannot put it.
+        EpisodeError: the description lacks the tool, tf lacks a link of the arm, no link moves, or a link has a pose
+            that its joint cannot reach.
     """
     carriers = {joint.child: joint for joint in description.joints}
     chain, link = list[Joint](), tool_frame
@@ -181,10 +183,10 @@ def log_from_links(
 
 
 def _angle(tree: TransformTree, joint: Joint, times: NDArray[np.float64]) -> NDArray[np.float64]:
-    """[T] angle of a joint [rad], or its way [m].
+    """[T] angles of a joint [rad], or displacements of a prismatic joint [m].
 
     Raises:
-        EpisodeError: tf does not connect its links, or moves its child otherwise than the joint does.
+        EpisodeError: tf does not connect the links, or the child moves in a direction other than the joint axis.
     """
     moved = np.linalg.inv(joint.T_parent_joint) @ tree.lookup(joint.parent, joint.child, times)
     turn, shift = Rotation.from_matrix(moved[:, :3, :3]).as_rotvec(), moved[:, :3, 3]
@@ -202,14 +204,14 @@ def _angle(tree: TransformTree, joint: Joint, times: NDArray[np.float64]) -> NDA
 
 
 def _placed(poses: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Positions [T, 3] and quaternions [T, 4] (w, x, y, z) of poses [T, 4, 4]."""
+    """Split poses [T, 4, 4] into positions [T, 3] and quaternions [T, 4] (w, x, y, z)."""
     return poses[:, :3, 3], Rotation.from_matrix(poses[:, :3, :3]).as_quat(scalar_first=True)
 
 
 def _series(
     where: str, messages: Sequence[tuple[float, Any]], names: Sequence[str]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Times [N], each once and in order, and positions [N, J] from the messages that have all of `names`."""
+    """Return sorted unique times [N] and positions [N, J], from the messages that have all of `names`."""
     held = [(t, dict(zip(message.name, message.position, strict=False))) for t, message in messages]
     rows = [(t, [at[name] for name in names]) for t, at in held if set(names) <= at.keys()]
     times = np.array([t for t, _ in rows])

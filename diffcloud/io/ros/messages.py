@@ -1,8 +1,8 @@
-"""What ROS messages hold, of either generation: stamps, depth and colour images, intrinsics.
+"""Decode ROS 1 and ROS 2 messages: time stamps, depth and colour images, camera intrinsics.
 
-Depth comes as 16-bit integers in millimetres (16UC1), as 32-bit floats in metres (32FC1), or as a PNG of either in a
-CompressedImage, or in RVL. Neither has floats: compressed_depth_image_transport stores inverse depth in 16 bits instead,
-and how to get back in 12 bytes before the image (a format number and two floats a, b): depth = a / (value - b), 0 is no
+Depth images have 16-bit integers in millimetres (16UC1) or 32-bit floats in metres (32FC1). A CompressedImage has
+either as PNG or RVL. Both formats lack floats, so compressed_depth_image_transport stores inverse depth in 16 bits. A
+header of 12 bytes (a format number, floats a and b) gives the inverse: depth = a / (value - b). Value 0 is no
 measurement.
 """
 
@@ -21,27 +21,28 @@ from diffcloud.io.rvl import decode_rvl
 
 DepthEncoding = Literal["16UC1", "32FC1"]
 DEPTH_UNITS_M: dict[DepthEncoding, float] = {"16UC1": 0.001, "32FC1": 0.00025}
-"""Of the raw episode's 16-bit images. Floats are stored in quarters of a millimetre, up to 16 m."""
+"""Unit of the raw episode's 16-bit depth images. Floats are stored in quarters of a millimetre, up to 16 m."""
 _COMPRESSED_DEPTH_HEADER = struct.Struct("<iff")
 _LENSES: dict[str, Distortion] = {
     **dict.fromkeys(("", "plumb_bob", "rational_polynomial"), "brown_conrady"),
     **dict.fromkeys(("equidistant", "fisheye"), "equidistant"),
 }
-"""OpenCV tells its models apart by the number of coefficients, and drivers name them carelessly."""
+"""ROS distortion model -> ours. Similar models share an entry, because OpenCV distinguishes them by the number of
+coefficients and drivers name them inconsistently."""
 _COLOR_CHANNELS = {"rgb8": (0, 1, 2), "bgr8": (2, 1, 0), "rgba8": (0, 1, 2), "bgra8": (2, 1, 0), "mono8": (0, 0, 0)}
 
 
 def stamp_s(message: Any) -> float:
-    """A message's own stamp [s]; 0 where nobody set it, and at the start of simulated time."""
+    """Return a message's time stamp [s]. It is 0 if the message was not stamped, or at the start of simulated time."""
     stamp = message.header.stamp
     return float(stamp.sec + 1e-9 * stamp.nanosec)
 
 
 def depth_encoding(message: Any, topic: str) -> DepthEncoding:
-    """What the numbers of an Image or CompressedImage of depth mean.
+    """Return the encoding of a depth message (Image or CompressedImage).
 
     Raises:
-        EpisodeError: an encoding or compression that is not read; names it.
+        EpisodeError: the encoding or compression is not supported.
     """
     if hasattr(message, "encoding"):
         if message.encoding == "32FC1":
@@ -51,7 +52,7 @@ def depth_encoding(message: Any, topic: str) -> DepthEncoding:
         raise EpisodeError(f"{topic} has the encoding {message.encoding!r}; depth is 16UC1, 32FC1 or compressedDepth.")
     stated, _, compression = (part.strip() for part in message.format.partition(";"))
     if not _is_compressed_depth(message):
-        # plain images: 16-bit PNG is millimetres, and the decoder refuses all else; floats cannot be in one
+        # A plain compressed image cannot have floats. A 16-bit PNG is in millimetres; the decoder refuses others.
         if stated == "32FC1":
             raise EpisodeError(f"{topic} has the format {message.format!r}, which loses floats; record compressedDepth.")
         return "16UC1"
@@ -72,13 +73,13 @@ def depth_encoding(message: Any, topic: str) -> DepthEncoding:
 
 
 def depth_image(message: Any, topic: str, encoding: DepthEncoding) -> NDArray[np.uint16]:
-    """Depth [H, W] in the unit of its encoding (`DEPTH_UNITS_M`); 0 is no measurement, or beyond 16 bits.
+    """Decode depth [H, W] in the unit of its encoding (`DEPTH_UNITS_M`). Missing or too large values are 0.
 
     Args:
-        encoding: of the topic's first message, which fixes the unit for all.
+        encoding: encoding of the topic's first message, which all others must have.
 
     Raises:
-        EpisodeError: damaged, or of another encoding.
+        EpisodeError: the message is damaged, or has another encoding.
     """
     own = depth_encoding(message, topic)
     if own != encoding:
@@ -105,10 +106,10 @@ def depth_image(message: Any, topic: str, encoding: DepthEncoding) -> NDArray[np
 
 
 def color_image(message: Any, topic: str) -> NDArray[np.uint8]:
-    """Colour [H, W, 3] red, green, blue.
+    """Decode colour [H, W, 3] (red, green, blue).
 
     Raises:
-        EpisodeError: damaged, or of an encoding that is not read.
+        EpisodeError: the message is damaged, or its encoding is not supported.
     """
     if not hasattr(message, "encoding"):
         return decode_color(bytes(message.data), topic)
@@ -118,19 +119,20 @@ def color_image(message: Any, topic: str) -> NDArray[np.uint8]:
 
 
 def is_calibrated(message: Any) -> bool:
-    """Whether a CameraInfo has a camera matrix: drivers send zeros until somebody calibrates the camera."""
+    """Whether a CameraInfo has a camera matrix. Drivers of uncalibrated cameras send zeros."""
     return bool(np.any(_field(message, "k")))
 
 
 def camera_intrinsics(message: Any, name: str, topic: str, *, rectified: bool = False) -> Intrinsics:
-    """Of a CameraInfo message.
+    """Return the intrinsics in a CameraInfo message.
 
     Args:
-        name, topic: the camera and its camera_info, for messages.
-        rectified: of images without distortion, whose camera is the left part of P; K and D are of those with it.
+        name: name of the camera, for messages.
+        topic: topic of the message, for messages.
+        rectified: use P, the camera matrix of undistorted images. Otherwise use K and D of the original images.
 
     Raises:
-        EpisodeError: a camera that was never calibrated, a lens model that is not read, or numbers that no camera has.
+        EpisodeError: the camera is not calibrated, its lens model is not supported, or a value is impossible.
     """
     where = f"Camera {name}: its camera_info on {topic}"
     if not is_calibrated(message):
@@ -159,12 +161,12 @@ def camera_intrinsics(message: Any, name: str, topic: str, *, rectified: bool = 
 
 
 def _field(message: Any, name: str) -> NDArray[np.float64]:
-    """ROS 1 writes D, K and P, ROS 2 d, k and p."""
+    """Return the array D, K or P. ROS 1 has upper-case field names, ROS 2 lower-case ones."""
     return np.asarray(getattr(message, name if hasattr(message, name) else name.upper()), dtype=np.float64)
 
 
 def _whole(lens: list[float], allowed: tuple[int, ...]) -> list[float]:
-    """Coefficients up to the least allowed count that holds all that are not zero."""
+    """Truncate or pad lens coefficients to the smallest allowed number that keeps all nonzero ones."""
     used = max(index for index, value in enumerate(lens, start=1) if value)
     count = next((size for size in allowed if size >= used), None)
     return lens if count is None else (lens + [0.0] * count)[:count]
@@ -175,13 +177,14 @@ def _is_compressed_depth(message: Any) -> bool:
 
 
 def _in_units(metres: NDArray[Any], unit_m: float) -> NDArray[np.uint16]:
-    """Rounded to whole units; what is not finite, not in front of the camera or beyond 16 bits is no measurement."""
+    """Round depth to whole units. Values that are not finite, not positive or beyond 16 bits become 0 (no
+    measurement)."""
     known = np.isfinite(metres) & (metres > 0) & (metres < 65535.5 * unit_m)
     return np.where(known, np.rint(np.where(known, metres, 0) / unit_m), 0).astype(np.uint16)
 
 
 def _pixels(message: Any, kind: np.dtype[Any]) -> NDArray[Any]:
-    """[H, W, C] of an Image message; rows may be padded, bytes may be swapped."""
+    """Return the pixels [H, W, C] of an Image message, without row padding and in its byte order."""
     kind = kind.newbyteorder(">" if message.is_bigendian else "<")
     data = np.frombuffer(bytes(message.data), np.uint8)
     channels = {"rgb8": 3, "bgr8": 3, "rgba8": 4, "bgra8": 4}.get(message.encoding, 1)

@@ -1,7 +1,7 @@
-"""Which image of a ROS camera comes when, and which colour image belongs to which depth image.
+"""Order the images of a ROS camera in time, and assign colour images to depth images.
 
-All stamps are known before the first image is written: messages that arrived out of order are sorted, a clock that was
-set back is refused, and each depth image gets the colour image nearest to it in time.
+All stamps are read before the first image is written. Messages that arrived out of order are sorted. A clock that was
+set back is an error. Each depth image gets the nearest colour image in time.
 """
 
 from __future__ import annotations
@@ -17,36 +17,35 @@ Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
 _LATEST_S = 0.5
-"""Networks deliver a message so much later than a younger one; more than that is another clock."""
+"""Largest delay of a message in a network. An older stamp means that the clock was changed."""
 _PAIR_S = (0.02, 0.05)
-"""Least and greatest tolerance between colour and depth: the cloth's edge may have moved by centimetres after more."""
+"""Limits of the time tolerance between colour and depth. Within 50 ms, the cloth's edge may move by centimetres."""
 
 
 @dataclass(frozen=True)
 class Pairing:
-    """The frames of one camera in order of time."""
+    """The frames of one camera in order of time, as message numbers in order of arrival."""
 
     times: Floats
-    """[T] of depth [s]."""
+    """[T] stamps of the depth images [s]."""
     depths: Integers
-    """[T] number of the depth message, in order of arrival."""
+    """[T] number of the depth message."""
     colors: Integers
-    """[T] number of the colour message; -1 for none."""
+    """[T] number of the colour message, -1 for none."""
     warnings: tuple[str, ...]
 
 
 def pair(camera: str, depth_topic: str, depth_s: ArrayLike, color_s: ArrayLike | None) -> Pairing:
-    """Sort depth images and give each its colour image.
+    """Sort depth images and assign a colour image to each.
 
-    The tolerance is half a frame interval of the slower stream (no colour image can be asked to be nearer), within
-    20 and 50 ms.
+    The tolerance is half a frame interval of the slower stream, limited to 20 to 50 ms.
 
     Args:
-        depth_s: stamps in order of arrival [s].
-        color_s: of the colour images that are aligned to depth; None without any.
+        depth_s: stamps of the depth images in order of arrival [s].
+        color_s: stamps of the colour images that are aligned to depth. None if there is no such stream.
 
     Raises:
-        EpisodeError: a stamp lies more than half a second before an earlier message's; names topic and message.
+        EpisodeError: a stamp is more than half a second older than an earlier message's.
     """
     warnings: list[str] = []
     stamps = np.array(depth_s)
@@ -84,7 +83,7 @@ def pair(camera: str, depth_topic: str, depth_s: ArrayLike, color_s: ArrayLike |
 
 
 def _sorted(topic: str, stamps: Floats) -> tuple[Integers, int]:
-    """(messages in order of their stamps, each stamp once; how many arrived after a younger one)."""
+    """Return message numbers sorted by stamp without duplicate stamps, and the number of messages that arrived late."""
     youngest = np.maximum.accumulate(stamps)
     behind = youngest - stamps
     worst = int(behind.argmax())

@@ -1,8 +1,8 @@
-"""Which messages of joint states belong to one robot's driver.
+"""Separate the joint states of a robot's driver from those of other publishers.
 
-Several nodes may send the same joints: a driver, a controller its desired angles, joint_state_publisher its zeros. Mixed
-together they describe an arm that jumps back and forth. Topic, sender, frame and the names of the joints tell them apart.
-Where all of these are equal, the angles do, since no arm jumps.
+Several nodes may publish the same joints: the driver, a controller (desired angles), or joint_state_publisher (zeros).
+Mixed together, they describe an arm that jumps back and forth. Topic, sender, frame and joint names distinguish
+publishers. If all of these are equal, continuity of the angles is used.
 """
 
 from __future__ import annotations
@@ -20,37 +20,37 @@ from diffcloud.errors import EpisodeError
 Floats = NDArray[np.float64]
 
 _JUMP_RAD, _FASTEST_RAD_S = 0.02, 10.0
-"""Two messages of one driver differ by no more than the first plus the second times the time between them."""
+"""Largest change between messages of one driver: the first plus the second times the time between them."""
 _LEAST_PART, _LEAST_COUNT = 0.05, 3
-"""Of a topic's messages: fewer that jump are faulty messages of one driver."""
+"""Smallest share and number of a publisher's messages in a topic. Fewer jumps are faulty messages of one driver."""
 _MOST_TRACKS = 8
 _STILL_RAD = 1e-3
-"""Joints that move by less over the whole recording stand still."""
+"""Joints that move by less during the recording are considered stationary."""
 
 
 @dataclass(frozen=True)
 class JointMessage:
-    """A sensor_msgs/JointState as it came."""
+    """A sensor_msgs/JointState message with its time and origin."""
 
     time_s: float
     topic: str
     sender: str
-    """ROS 1: the node; ROS 2 does not record it."""
+    """Node name in ROS 1. ROS 2 does not record it, so there it is the number of the connection."""
     message: Any
 
 
 @dataclass(frozen=True)
 class _Publisher:
-    """Messages that one node sent, as far as that can be told."""
+    """Messages that come from one node, as far as can be determined."""
 
     topic: str
     messages: tuple[JointMessage, ...]
     names: frozenset[str]
-    """Of the joints that matter."""
+    """Names of the requested joints in these messages."""
     moves: bool
 
     def contradicts(self, other: _Publisher) -> bool:
-        """Whether both send one joint in the same span of time."""
+        """Whether both publish a common joint in overlapping time ranges."""
         first, second = ([held.time_s for held in one.messages] for one in (self, other))
         return bool(self.names & other.names) and max(min(first), min(second)) < min(max(first), max(second))
 
@@ -58,16 +58,16 @@ class _Publisher:
 def of_one_driver(
     where: str, messages: Sequence[JointMessage], needed: Collection[str], named: Collection[str]
 ) -> tuple[list[JointMessage], list[str]]:
-    """(the messages that state each joint once, in order of arrival; warnings about those that were left out).
+    """Select one publisher per joint. Return its messages in order of arrival, and warnings about omitted messages.
 
     Args:
-        where: the recording, for messages.
-        messages: in order of arrival; of the named topics only, if topics are named.
-        needed: joints that matter.
-        named: topics that the user named, also as TOPIC#NUMBER for one of several publishers on it.
+        where: name of the recording, for messages.
+        messages: messages in order of arrival. If the user selected topics, only theirs.
+        needed: joints of interest.
+        named: topics that the user selected, also as TOPIC#NUMBER for one of several publishers.
 
     Raises:
-        EpisodeError: several publishers send the same joints, and none or several are named; lists them.
+        EpisodeError: several publishers send the same joints, and none or several are selected.
     """
     publishers = _publishers(messages, frozenset(needed))
     candidates = {
@@ -87,7 +87,7 @@ def of_one_driver(
         kept = asked | {index for index in candidates if publishers[index].topic in plain}
     moving = {index for index in kept if publishers[index].moves}
     if named and len({publishers[index].topic for index in kept}) == 1 and len(moving) == 1:
-        kept = moving  # the topic is named, and all else on it stands still
+        kept = moving  # the topic is selected, and only one of its publishers moves
     if any(publishers[first].contradicts(publishers[second]) for first, second in combinations(sorted(kept), 2)):
         raise EpisodeError(_candidates(where, publishers, labels, ""))
     warnings = [
@@ -103,7 +103,7 @@ def of_one_driver(
 
 
 def _publishers(messages: Sequence[JointMessage], needed: frozenset[str]) -> list[_Publisher]:
-    """Of the joints that matter, in order of their first messages."""
+    """Group messages with the requested joints into publishers, in order of their first messages."""
     groups: dict[tuple[str, str, str, tuple[str, ...]], list[JointMessage]] = {}
     for held in messages:
         names = tuple(held.message.name)
@@ -122,13 +122,13 @@ def _publishers(messages: Sequence[JointMessage], needed: frozenset[str]) -> lis
 
 
 def _continuous(times: Floats, angles: Floats) -> list[NDArray[np.int64]]:
-    """Rows of each of several drivers whose angles [N, J] alternate; all rows of one where none alternate."""
+    """Split rows of angles [N, J] into drivers whose messages alternate. Returns one group if they do not alternate."""
     whole = [np.arange(len(times))]
     jumps = _apart(np.diff(angles, axis=0)) > _JUMP_RAD + _FASTEST_RAD_S * np.diff(times).clip(0)
     if jumps.sum() < 2 * _LEAST_COUNT:
         return whole
     tracks: list[list[int]] = []
-    for row in range(len(times)):  # each depends on those before
+    for row in range(len(times)):  # sequential, because each assignment depends on the previous ones
         last = [track[-1] for track in tracks]
         away = _apart(angles[row] - angles[last]) if last else np.zeros(0)
         reach = _JUMP_RAD + _FASTEST_RAD_S * (times[row] - times[last]).clip(0)
@@ -146,12 +146,12 @@ def _continuous(times: Floats, angles: Floats) -> list[NDArray[np.int64]]:
 
 
 def _apart(difference: Floats) -> Floats:
-    """[N] largest difference of a joint; a whole turn is none, as joints that turn without end count it away."""
+    """[N] largest angle difference of a joint, modulo whole turns, since continuous joints may wrap around."""
     return np.asarray(np.abs((difference + np.pi) % (2 * np.pi) - np.pi).max(axis=-1))
 
 
 def _labels(publishers: Sequence[_Publisher], candidates: Sequence[int]) -> dict[int, str]:
-    """What the user may name: the topic, with a number where several on it contradict each other."""
+    """Publisher -> the label for the user to select: the topic, with a number if publishers on it conflict."""
     labels: dict[int, str] = {}
     for topic in {publishers[index].topic for index in candidates}:
         own = [index for index in candidates if publishers[index].topic == topic]

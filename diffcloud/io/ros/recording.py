@@ -1,11 +1,10 @@
-"""Recordings of ROS, without ROS: rosbag1 files, rosbag2 folders and files, MCAP.
+"""Read ROS recordings (rosbag1 files, rosbag2 folders and files, MCAP) without a ROS installation.
 
-A recording is read twice. The first pass takes everything but the pixels: which topics there are, stamps, intrinsics, tf
-and joints. So whatever is wrong with them is said before anything is written. The second pass takes the images.
+A recording is read twice. The first pass reads everything except the pixels: topics, stamps, intrinsics, tf and joints.
+So errors in these are found before anything is written. The second pass reads the images.
 
-Colour goes into a raw episode only where it shares depth's pixels. Unaligned colour could be looked up through the
-cameras' extrinsics, but where the colour camera sees something else in front, or depth has a hole, the wrong colour would
-come: it is left out, with a warning.
+Colour is imported only if its pixels are aligned with depth. Unaligned colour could be reprojected with the extrinsics,
+but occlusions and depth holes would give wrong colours. So it is omitted, with a warning.
 """
 
 from __future__ import annotations
@@ -67,23 +66,24 @@ def ros_recording(
     description: Callable[[], RobotDescription] | None = None,
     topics: Sequence[str] = (),
 ) -> Recording:
-    """A recording of ROS; images are read lazily.
+    """Open a ROS recording. Its images are read lazily.
 
     Args:
         paths: one file or rosbag2 folder, or all parts of a split recording.
-        world_frame, tool_frame: tf frames; poses that tf does not have stay open, with a warning.
-        joint_names: of the arm, in order; None takes joint_1, joint_2, ... of joint_states.
-        gripper_joint: its position becomes 0 (open) to 1 (closed). None: the arm has no gripper.
-        gripper_open, gripper_closed: that position [rad or m]; None takes that of a Robotiq 2F-85.
-        description: returns the robot's description, for a recording without joint_states whose tf has the robot's
-            links; None: such a recording gets no joint log.
-        topics: those to take where several could be. Of each kind (depth, colour, camera_info, joint states, transforms)
-            these alone are taken, if any of the kind is named. TOPIC#NUMBER is one of several publishers of joint states.
+        world_frame, tool_frame: tf frames. If tf lacks a pose, it stays unknown, with a warning.
+        joint_names: joints of the arm in order. None: joint_1, joint_2, ... of joint_states.
+        gripper_joint: joint that gives the gripper state, 0 (open) to 1 (closed). None: the arm has no gripper.
+        gripper_open: position of this joint if the gripper is open [rad or m].
+        gripper_closed: position if it is closed. None: that of a Robotiq 2F-85.
+        description: function that returns the robot description. It is needed for a joint log if the recording has no
+            joint_states, but the link frames in tf.
+        topics: topics to use where there are several candidates of one kind (depth, colour, camera_info, joint states,
+            transforms). TOPIC#NUMBER selects one of several publishers of joint states.
 
     Raises:
-        ConfigError: a gripper whose positions, open and closed, are equal or no numbers.
-        EpisodeError: unreadable, one part of a split recording, without depth and camera_info, stamps that run backwards,
-            without the named joints or topics, or with several candidates of which none is named; lists what there is.
+        ConfigError: open and closed position of the gripper are equal or not finite.
+        EpisodeError: the recording is not readable, or not all parts are given. Also if depth, camera_info, or a
+            requested joint or topic is missing, stamps run backwards, or several candidates exist and none is selected.
     """
     grip = Grip.of(gripper_joint, gripper_open, gripper_closed)
     split = refuse_lone_parts(paths)
@@ -101,7 +101,7 @@ def ros_recording(
         warnings += why_not
         pairing = pair(name, own.depth, depth.stamps, None if color is None else scan.images[color].stamps)
         warnings += pairing.warnings
-        assert depth.encoding is not None  # of every depth topic
+        assert depth.encoding is not None  # true for all depth topics
         sources[name] = _Source(own.depth, color, depth.encoding, pairing)
         place = None
         try:
@@ -143,21 +143,21 @@ def ros_recording(
 
 @dataclass
 class _Images:
-    """What the first pass keeps of a topic with images."""
+    """Data of an image topic from the first pass."""
 
     frame: str
     """tf frame of the first message."""
     size: tuple[int, int] | None
-    """(width, height) of the first colour image; of depth camera_info says it."""
+    """(width, height) of the first colour image. None for depth, whose size is in camera_info."""
     encoding: DepthEncoding | None
-    """Of the first depth image; None for colour."""
+    """Encoding of the first depth image. None for colour."""
     stamps: NDArray[np.float64] = field(default_factory=lambda: np.empty(0))
-    """In order of arrival [s]."""
+    """[N] stamps in order of arrival [s]."""
 
 
 @dataclass
 class _Scan:
-    """Everything but the pixels."""
+    """Result of the first pass: everything except the pixels."""
 
     topics: Mapping[str, str]
     cameras: Mapping[str, CameraTopics]
@@ -170,7 +170,7 @@ class _Scan:
 
 @dataclass(frozen=True)
 class _Source:
-    """Where the images of a camera come from."""
+    """Image topics of a camera and the pairing of their messages."""
 
     depth: str
     color: str | None
@@ -200,7 +200,7 @@ def _scan(paths: Sequence[Path], shown: str, named: Sequence[str]) -> _Scan:
             message = reader.deserialize(raw, kind)
             if kind == CAMERA_INFO:
                 if not is_calibrated(scan.infos.setdefault(topic, message)):
-                    scan.infos[topic] = message  # until one is
+                    scan.infos[topic] = message  # keep the latest message until one is calibrated
                 continue
             own = stamps.setdefault(topic, [])
             if kind in _TF:
@@ -221,7 +221,7 @@ def _scan(paths: Sequence[Path], shown: str, named: Sequence[str]) -> _Scan:
     refuse_conflicts([(topic, item) for topic, _, item in transforms], shown)
     static = {topic for topic in stamps if topic.endswith("tf_static")}
     times, warnings = message_times({topic: held for topic, held in stamps.items() if topic not in static})
-    times |= {topic: np.array([stamp for stamp, _ in stamps[topic]]) for topic in static}  # holds for good
+    times |= {topic: np.array([stamp for stamp, _ in stamps[topic]]) for topic in static}  # valid at all times
     scan.warnings += warnings
     for topic, held in scan.images.items():
         held.stamps = times[topic]
@@ -231,7 +231,7 @@ def _scan(paths: Sequence[Path], shown: str, named: Sequence[str]) -> _Scan:
 
 
 def _senders(connections: Sequence[Any]) -> dict[tuple[int, str, int], str]:
-    """Who sends on a connection: the node's name in ROS 1; else which of the topic's connections in its file it is."""
+    """Connection -> sender: the node name in ROS 1, otherwise the connection's number for its topic and file."""
     senders: dict[tuple[int, str, int], str] = {}
     counts = Counter[tuple[str, int]]()
     for held in connections:
@@ -242,9 +242,10 @@ def _senders(connections: Sequence[Any]) -> dict[tuple[int, str, int], str]:
 
 
 def _refuse_other_clock(shown: str, robot: RobotLog, sources: Mapping[str, _Source]) -> None:
-    """
+    """Check that joint states and images have the same kind of clock.
+
     Raises:
-        EpisodeError: joint states are stamped since 1970 and images in simulated time, or the other way round.
+        EpisodeError: one is stamped since 1970 and the other in simulated time.
     """
     images = next(iter(sources.values())).pairing.times
     if (robot.times[0] < EPOCH_S) != (images[0] < EPOCH_S):
@@ -263,11 +264,11 @@ def _first_image(message: Any, topic: str, *, is_depth: bool) -> _Images:
 
 
 def _aligned_color(scan: _Scan, camera: CameraTopics) -> tuple[str | None, list[str]]:
-    """(the camera's colour topic whose pixels are those of depth, warnings if there is colour but none such)."""
+    """Return the camera's colour topic that is aligned with depth (or None), and warnings if colour is not aligned."""
     why_not = {}
     for topic in camera.colors:
         if topic not in scan.images:
-            continue  # announced, but never sent
+            continue  # the topic exists but has no message
         reason = _unaligned(scan, camera, topic)
         if reason is None:
             return topic, []
@@ -283,11 +284,11 @@ def _aligned_color(scan: _Scan, camera: CameraTopics) -> tuple[str | None, list[
 
 
 def _unaligned(scan: _Scan, camera: CameraTopics, color: str) -> str | None:
-    """Why the pixels of a colour image are not those of depth; None if they are."""
+    """Explain why a colour image is not aligned with depth, or return None if it is."""
     images, depth_info = scan.images[color], scan.infos[camera.info]
     size = (depth_info.width, depth_info.height)
     if images.size != size:
-        assert images.size is not None  # of every colour topic
+        assert images.size is not None  # true for all colour topics
         return f"has {images.size[0]} x {images.size[1]} pixels, depth {size[0]} x {size[1]}"
     if aligned_by_name(camera.depth) and same_camera(camera.depth, color):
         return None
@@ -311,7 +312,7 @@ def _brief(held: Intrinsics) -> str:
 
 
 def _equal(first: Intrinsics, second: Intrinsics) -> bool:
-    """Whether both say the same; the last digits may be rounded."""
+    """Whether two cameras have equal intrinsics, except for rounding."""
     one, other = (
         [held.width, held.height, held.fx, held.fy, held.cx, held.cy, *(*held.coefficients, *[0.0] * 14)[:14]]
         for held in (first, second)
@@ -322,7 +323,7 @@ def _equal(first: Intrinsics, second: Intrinsics) -> bool:
 
 
 def _frames(paths: Sequence[Path], sources: Mapping[str, _Source]) -> Iterator[RecordedFrame]:
-    """Frames of each camera in order of time, each with its colour image."""
+    """Yield the frames of all cameras, for each camera in order of time, with their colour images."""
     cameras = {name: _Assembly(name, source) for name, source in sources.items()}
     by_topic: dict[str, _Assembly] = {}
     for name, source in sources.items():
@@ -335,7 +336,7 @@ def _frames(paths: Sequence[Path], sources: Mapping[str, _Source]) -> Iterator[R
 
 
 class _Assembly:
-    """Puts one camera's frames together; holds images only until their frame is whole and its turn has come."""
+    """Assembles the frames of one camera. It keeps images only until their frame has been yielded."""
 
     def __init__(self, name: str, source: _Source) -> None:
         self._name, self._source = name, source
@@ -350,7 +351,7 @@ class _Assembly:
         self._next = 0
 
     def take(self, topic: str, message: Any) -> None:
-        """The next message of either topic."""
+        """Add the next message of the depth or colour topic."""
         kind = "depth" if topic == self._source.depth else "color"
         number = self._seen[kind]
         self._seen[kind] += 1
@@ -360,7 +361,7 @@ class _Assembly:
             self._colors[number] = color_image(message, topic)
 
     def finished(self) -> Iterator[RecordedFrame]:
-        """Frames whose images have come and whose predecessors are gone."""
+        """Yield complete frames whose predecessors have been yielded."""
         pairing = self._source.pairing
         while self._next in self._depths:
             number = int(pairing.colors[self._next])

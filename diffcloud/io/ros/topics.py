@@ -1,7 +1,7 @@
-"""Which topics of a ROS recording belong to which depth camera.
+"""Assign the topics of a ROS recording to depth cameras.
 
-Topics name camera and content by habit only: `/overhead/aligned_depth_to_color/image_raw`, `/lab/side/depth/image_raw`,
-`/side_depth/image`. What is left of a topic without the words for its content is its camera.
+Topic names follow no standard: `/overhead/aligned_depth_to_color/image_raw`, `/lab/side/depth/image_raw`,
+`/side_depth/image`. The camera is identified by the topic name without the words for its content.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ _CONTENT = {
     *("image", "images", "raw", "rect", "rectified", "compressed", "compresseddepth"),
     *("depth", "color", "colour", "rgb", "aligned", "to", "registered", "hw", "sw", "float"),
 }
-"""Words of topics that say what is in them, not whose it is."""
+"""Words in topic names that describe the content, not the camera."""
 _HOLDERS = {"camera", "cameras", "cam", "cams"}
-"""Folders that say only that cameras are in them, or that this is one."""
+"""Name parts that only mean "camera"."""
 
 Key = tuple[str, ...]
-"""The parts of a topic that name its camera."""
+"""The parts of a topic name that identify its camera."""
 
 
 @dataclass(frozen=True)
@@ -34,37 +34,37 @@ class CameraTopics:
     name: str
     depth: str
     info: str
-    """camera_info of depth."""
+    """camera_info topic of the depth images."""
     colors: tuple[str, ...]
-    """Colour images of the same camera, likeliest first; whether they are aligned to depth is another question."""
+    """Colour topics of the same camera, best candidate first. They may not be aligned to depth."""
 
 
 def is_depth(topic: str, kind: str) -> bool:
-    """Whether a topic holds depth images."""
+    """Whether a topic has depth images."""
     return kind in (IMAGE, COMPRESSED_IMAGE) and _content(topic) == "depth"
 
 
 def aligned_by_name(depth_topic: str) -> bool:
-    """Whether the topic itself says that its depth is aligned to the colour image."""
+    """Whether the topic name says that depth is aligned to the colour image."""
     topic = depth_topic.lower()
     other = re.search(r"depth_to_([a-z]+)", topic)
-    if other is not None:  # not to an infrared imager
+    if other is not None:  # alignment to an infrared camera is excluded
         return other.group(1) in ("color", "colour", "rgb")
     return "align" in topic or "registered" in topic
 
 
 def is_rectified(topic: str) -> bool:
-    """Whether the lens has been taken out of a topic's images, as image_proc and depth_image_proc say it in the name."""
+    """Whether the images are undistorted, according to the naming of image_proc and depth_image_proc."""
     return any({"rect", "rectified"} & set(part.split("_")) for part in topic.lower().split("/"))
 
 
 def same_camera(first: str, second: str) -> bool:
-    """Whether two topics name the same camera, as far as they name one."""
+    """Whether two topic names refer to the same camera."""
     return _without_holders(_key(first)) == _without_holders(_key(second))
 
 
 def info_topic(image_topic: str, topics: Mapping[str, str]) -> str | None:
-    """The nearest camera_info beside an image topic or above it."""
+    """Return the nearest camera_info topic in the same namespace as an image topic or above it, or None."""
     folder = image_topic
     while "/" in folder:
         folder = folder.rsplit("/", 1)[0]
@@ -74,15 +74,16 @@ def info_topic(image_topic: str, topics: Mapping[str, str]) -> str | None:
 
 
 def only_named(topics: Mapping[str, str], named: Collection[str], kinds: Collection[str]) -> set[str]:
-    """Topics of some message types; of these only the named ones, if any of them is named."""
+    """Return the topics of some message types. If the user selected any of these, return only the selected ones."""
     found = {topic for topic, kind in topics.items() if kind in kinds}
     return found & {name.partition("#")[0] for name in named} or found
 
 
 def refuse_unknown(topics: Mapping[str, str], named: Collection[str], where: str) -> None:
-    """
+    """Check that all selected topics exist.
+
     Raises:
-        EpisodeError: the user named a topic that the recording lacks; lists those that it has.
+        EpisodeError: a topic is missing. The message lists the existing topics.
     """
     unknown = [name for name in named if name.partition("#")[0] not in topics]
     if unknown:
@@ -90,16 +91,16 @@ def refuse_unknown(topics: Mapping[str, str], named: Collection[str], where: str
 
 
 def depth_cameras(topics: Mapping[str, str], where: str, named: Collection[str] = ()) -> dict[str, CameraTopics]:
-    """All depth cameras of a recording, by name; of several depth topics of one camera, the one aligned to colour.
+    """Find all depth cameras of a recording, by name. Depth aligned to colour is preferred.
 
     Args:
-        topics: message type by topic.
-        where: the recording, for messages.
-        named: topics that the user named: of each kind of message these alone are taken, if there are any.
+        topics: topic -> message type.
+        where: name of the recording, for messages.
+        named: topics that the user selected. For each kind of message, only these are used if there are any.
 
     Raises:
-        EpisodeError: no depth topic, several for one camera of which none is better, no camera_info beside one, or one
-            camera_info beside the depth of two cameras; lists the candidates.
+        EpisodeError: there is no depth topic, a camera has several equally good ones, a camera_info is missing, or two
+            cameras share one. The message lists the candidates.
     """
     depths: dict[Key, str] = {}
     held = {topic: topics[topic] for topic in topics if is_depth(topic, topics[topic])}
@@ -118,7 +119,7 @@ def depth_cameras(topics: Mapping[str, str], where: str, named: Collection[str] 
     for topic in depths.values():
         info = info_topic(topic, dict.fromkeys(stated, CAMERA_INFO))
         if info is None and len(depths) == 1 and len(stated) == 1 and stated <= set(named):
-            (info,) = stated  # it may lie anywhere
+            (info,) = stated  # a selected topic may be in any namespace
         if info is None:
             raise EpisodeError(
                 f"{where} has no camera_info beside {topic}; record it, the intrinsics are in it. "
@@ -151,12 +152,12 @@ def _listed(topics: Collection[str]) -> str:
 
 
 def _preference(topic: str, kind: str) -> tuple[bool, bool, bool]:
-    """Sorts aligned before not aligned, images as they are before compressed ones."""
+    """Sort key of depth topics: aligned before not aligned, then uncompressed before compressed."""
     return not aligned_by_name(topic), kind != IMAGE, "compressedDepth" not in topic
 
 
 def _content(topic: str) -> str | None:
-    """depth, color, or neither: the last part of a topic that says so, as a depth camera has colour images too."""
+    """Return "depth", "color" or None. The last part of the name decides, since a depth camera may also have colour."""
     for part in reversed(topic.lower().split("/")):
         if "depth" in part:
             return "depth"
@@ -166,10 +167,10 @@ def _content(topic: str) -> str | None:
 
 
 def _key(topic: str) -> Key:
-    """The topic's parts without the words for its content; empty where nothing else is left."""
+    """Return the parts of a topic name without words for its content. May be empty."""
     kept = []
     for part in topic.strip("/").split("/"):
-        # aligned to an infrared imager is no camera of that name
+        # Depth aligned to an infrared camera still belongs to the depth camera.
         words = re.sub(r"depth_to_[a-z0-9]+", "depth", part, flags=re.IGNORECASE).split("_")
         rest = "_".join(word for word in words if word.lower() not in _CONTENT)
         if rest:
@@ -182,7 +183,7 @@ def _without_holders(key: Key) -> Key:
 
 
 def _names(keys: list[Key]) -> list[str]:
-    """A plain name for each camera: as few parts of its topic as tell the cameras apart."""
+    """Choose short unique names for the cameras from the parts of their topic names."""
     named = [_without_holders(key) or key for key in keys]
     if len(set(named)) < len(named):
         named = keys
@@ -195,7 +196,7 @@ def _names(keys: list[Key]) -> list[str]:
 
 
 def _colors(topics: Mapping[str, str], cameras: list[Key]) -> dict[Key, tuple[str, ...]]:
-    """Of colour topics those of each camera, whose names share more with it than with any other camera."""
+    """Assign colour topics to the camera with the longest common name prefix. Ambiguous topics are dropped."""
     found: dict[Key, list[tuple[int, str]]] = {camera: [] for camera in cameras}
     for topic in topics:
         shared = {camera: _shared(_key(topic), camera) for camera in cameras}
@@ -209,7 +210,7 @@ def _colors(topics: Mapping[str, str], cameras: list[Key]) -> dict[Key, tuple[st
 
 
 def _shared(first: Key, second: Key) -> int:
-    """How many leading parts two keys have in common."""
+    """Number of leading parts that two keys have in common."""
     count = 0
     for one, other in zip(first, second, strict=False):
         if one != other:

@@ -1,7 +1,7 @@
-"""tf: where frames stand in each other over time.
+"""tf: poses of frames relative to each other over time.
 
-Each frame has one parent, so frames form a tree (or several). A camera and the robot's base may both hang from a third
-frame such as `world`: the way from one to the other goes up to the nearest frame above both, and down again.
+Each frame has one parent, so frames form one or several trees. The path between two frames goes through their nearest
+common ancestor. For example, camera and robot base may both be children of `world`.
 """
 
 from __future__ import annotations
@@ -19,25 +19,25 @@ from diffcloud.errors import EpisodeError
 Floats = NDArray[np.float64]
 
 _MOVED_M, _MOVED_RAD = 0.002, np.deg2rad(0.2)
-"""A camera that moves by more does not stand."""
+"""Largest motion of a frame that is considered fixed."""
 _LEAST_NORM = 1e-3
-"""Of a quaternion."""
+"""Smallest norm of a valid quaternion."""
 _LOOKED_AT = 1000
-"""Times at most."""
+"""Approximate number of times at which a fixed frame is checked."""
 
 
 @dataclass(frozen=True)
 class _Edge:
-    """A frame in its parent."""
+    """Transform of a frame relative to its parent over time."""
 
     parent: str
     stamps: Floats
-    """[N] in order [s]."""
+    """[N] sorted times [s]."""
     matrices: Floats
-    """[N, 4, 4]."""
+    """[N, 4, 4] child-to-parent transforms."""
 
     def at(self, times: Floats) -> Floats:
-        """[T, 4, 4] at the nearest stamps."""
+        """[T, 4, 4] transforms at the stamps nearest to `times`."""
         after = np.searchsorted(self.stamps, times).clip(0, len(self.stamps) - 1)
         before = (after - 1).clip(0)
         nearest = np.where(np.abs(self.stamps[before] - times) < np.abs(self.stamps[after] - times), before, after)
@@ -45,12 +45,13 @@ class _Edge:
 
 
 def refuse_conflicts(transforms: Sequence[tuple[str, Any]], where: str) -> None:
-    """
+    """Check that topics do not contradict each other.
+
     Args:
         transforms: (topic, geometry_msgs/TransformStamped).
 
     Raises:
-        EpisodeError: two topics put one frame into different places; names both.
+        EpisodeError: two topics give a frame different poses. The message names both.
     """
     owners: dict[str, dict[str, list[Any]]] = {}
     for topic, item in transforms:
@@ -65,7 +66,7 @@ def refuse_conflicts(transforms: Sequence[tuple[str, Any]], where: str) -> None:
 
 
 def _agree(items: Sequence[Any]) -> bool:
-    """Whether all transforms say the same."""
+    """Whether all transforms have the same parent and pose, within the tolerance."""
     if len({_plain(item.header.frame_id) for item in items}) > 1:
         return False
     moves = np.array([[getattr(item.transform.translation, axis) for axis in "xyz"] for item in items])
@@ -75,7 +76,7 @@ def _agree(items: Sequence[Any]) -> bool:
 
 
 class TransformTree:
-    """All transforms of a recording.
+    """All transforms of a recording as a tree of frames.
 
     Args:
         transforms: (time [s], geometry_msgs/TransformStamped).
@@ -108,24 +109,24 @@ class TransformTree:
             self._edges[child] = _Edge(parents[0], np.array([t for t, _ in entries]), matrices)
 
     def lookup(self, target: str, source: str, times: Floats) -> Floats:
-        """[T, 4, 4] that maps points of `source` to `target` at times [T], each edge at its nearest stamp.
+        """[T, 4, 4] transform from `source` to `target` at times [T]. Each edge uses its nearest stamp.
 
         Raises:
-            EpisodeError: tf does not connect them, or puts a frame on the way into two others.
+            EpisodeError: tf does not connect the frames, or a frame between them has two parents.
         """
         up, down = self._way(target, source)
         return np.linalg.inv(self._chain(down, times)) @ self._chain(up, times)
 
     def stamps(self, frame: str) -> Floats:
-        """[N] when a frame's place in its parent was told [s]; empty where it never was."""
+        """[N] times at which the frame's pose relative to its parent was sent [s]. Empty if never."""
         edge = self._edges.get(_plain(frame))
         return np.empty(0) if edge is None else edge.stamps
 
     def fixed(self, target: str, source: str) -> Floats:
-        """[4, 4] that maps points of `source` to `target` for good.
+        """[4, 4] constant transform from `source` to `target`.
 
         Raises:
-            EpisodeError: as `lookup`, or `source` moves in `target`.
+            EpisodeError: as `lookup`, or `source` moves relative to `target`.
         """
         stamps = [self._edges[frame].stamps for way in self._way(target, source) for frame in way]
         times = np.unique(np.concatenate([np.zeros(1), *stamps]))
@@ -140,7 +141,7 @@ class TransformTree:
         return np.asarray(poses[0])
 
     def _way(self, target: str, source: str) -> tuple[list[str], list[str]]:
-        """Frames from `source`, and from `target`, up to below the nearest frame above both."""
+        """Return the frames from `source`, and from `target`, up to but without their nearest common ancestor."""
         up, down = self._above(source), self._above(target)
         common = next((frame for frame in up if frame in down), None)
         if common is None:
@@ -154,14 +155,14 @@ class TransformTree:
         return up[: up.index(common)], down[: down.index(common)]
 
     def _above(self, frame: str) -> list[str]:
-        """The frame, its parent, and so on up to the root."""
+        """Return the frame and its ancestors up to the root."""
         found = [_plain(frame)]
         while found[-1] in self._edges and self._edges[found[-1]].parent not in found:
             found.append(self._edges[found[-1]].parent)
         return found
 
     def _chain(self, frames: list[str], times: Floats) -> Floats:
-        """[T, 4, 4] that maps points of frames[0] to the parent of the last; each is the child of the next."""
+        """[T, 4, 4] transform from frames[0] to the parent of the last frame. Each frame is the child of the next."""
         result = np.tile(np.eye(4), (len(times), 1, 1))
         for frame in frames:
             result = self._edges[frame].at(times) @ result
@@ -175,5 +176,5 @@ def _is_valid(transform: Any) -> bool:
 
 
 def _plain(frame: str) -> str:
-    """ROS 1 allows a leading slash."""
+    """Normalise a frame name. ROS 1 allows a leading slash."""
     return frame.strip("/")

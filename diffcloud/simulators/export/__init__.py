@@ -1,5 +1,6 @@
-"""A fitted cloth for other simulators: `targets` lists them, `cloth` says what of it they can be given, `write` writes
-their files, `check` runs these and compares.
+"""Export a fitted cloth to other simulators.
 
-Scripts that run an exported cloth need nothing of this package; they lie in `diffcloud.simulators.scripts`.
+`targets` lists the simulators, `cloth` converts the fit to a problem that they can simulate, `write` writes their
+files, and `check` runs these and compares. The exported scripts do not need this package; they are in
+`diffcloud.simulators.scripts`.
 """

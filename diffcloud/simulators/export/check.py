@@ -1,6 +1,6 @@
-"""Run what was exported and compare: known answers with the fitted material, and the recorded motion.
+"""Run an exported cloth and compare: analytical solutions with the fitted material, and the recorded motion.
 
-The motion is run by the exported script in a process of its own, as its user would.
+The exported script runs in a separate process, as a user would run it.
 """
 
 from __future__ import annotations
@@ -26,13 +26,13 @@ from diffcloud.simulators.problems import Known, cantilever, strip
 Runnable = Literal["mujoco", "newton"]
 _SCRIPTS: dict[Runnable, str] = {"mujoco": "run_mujoco.py", "newton": "run_newton.py"}
 _VBD_STEPS = {"strip": 5_000, "cantilever": 15_000}
-"""With which VBD converges on known answers; more are lost in its single precision."""
+"""Number of time steps with which VBD converges to the analytical solutions. More steps lose accuracy (float32)."""
 _MINUTES = 30
 
 
 @dataclass(frozen=True)
 class Answer:
-    """One measure of a test whose answer is known."""
+    """One quantity of a test with an analytical solution."""
 
     test: str
     measure: str
@@ -42,32 +42,33 @@ class Answer:
 
     @property
     def error(self) -> float:
-        """Of theirs, relative."""
+        """Relative error of the target simulator."""
         return self.theirs / self.theory - 1
 
 
 @dataclass(frozen=True)
 class Checked:
-    """An exported cloth in its target."""
+    """Results of an exported cloth in its target simulator."""
 
     answers: list[Answer]
     times: NDArray[np.float64]
     """[T] [s]"""
     apart_mm: NDArray[np.float64]
-    """[T] from the fitted motion, RMS over nodes; NaN from where the target diverged."""
+    """[T] RMS distance of the nodes from the fitted motion. NaN after the target simulator diverged."""
     simplified_mm: NDArray[np.float64]
-    """[T] from the fitted motion to that of the problem in this simulator: what the target could not be given."""
+    """[T] the same for the exported problem in DiffCloud's simulator, that is, the effect of simplifications."""
 
     def largest(self, test: str) -> float:
-        """The largest relative error in a test."""
+        """Return the largest relative error in a test."""
         return max(abs(answer.error) for answer in self.answers if answer.test == test)
 
 
 def check_export(cloth: ExportedCloth, target: Runnable, folder: Path, tell: Callable[[str], None]) -> Checked:
-    """
+    """Run the tests with analytical solutions and the exported script in the target simulator.
+
     Args:
-        folder: with the exported files.
-        tell: is called with what is done next.
+        folder: folder with the exported files.
+        tell: called with the name of each step.
 
     Raises:
         ConfigError: the script fails.

@@ -1,4 +1,4 @@
-"""What is exported: a fitted cloth as a problem that other simulators can be given, and what that leaves out."""
+"""Convert a fitted cloth to a problem for other simulators, and list what is lost in the conversion."""
 
 from __future__ import annotations
 
@@ -24,37 +24,37 @@ from diffcloud.simulators import ours
 from diffcloud.simulators.problem import Problem, Sheet, Track, distances
 
 WORTH_SAYING = 0.01
-"""Relative difference of a stiffness, or strain of the start, above which it is said."""
+"""Relative difference of a stiffness, or initial strain, above which it is reported."""
 _DIGITS = 12
-"""Of paths in metres."""
+"""Decimal places of the paths of held nodes in metres."""
 _LEVEL = np.deg2rad(0.1)
 _STRAINED = (0.0, 0.25, 0.5, 1.0)
-"""Where between rest and their reference strain the tables are looked up for a material that stiffens."""
+"""Strains to try for a strain-stiffening material, as fractions of the reference strain of its tables."""
 
 
 @dataclass(frozen=True)
 class ExportedCloth:
-    """A fitted cloth. Lengths in metres, in the recording's frame made level: z points up."""
+    """A fitted cloth in metres, in the recording's frame, levelled such that z is up."""
 
     problem: Problem
-    """Mesh as it lies at the start, isotropic material, and the recorded motion of what is held."""
+    """Initial mesh, isotropic material, and the recorded motion of the held nodes."""
     scene: Scene
-    """The same with the whole material, air and friction."""
+    """The same with the complete material, air and friction."""
     motion: NDArray[np.float64]
-    """[T, V, 3] as fitted, at the problem's times [m]."""
+    """[T, V, 3] fitted node positions at the problem's times [m]."""
     left_out: tuple[str, ...]
-    """What neither of them has of the fitted scene, each as a sentence."""
+    """Sentences about what both `problem` and `scene` lack of the fitted scene."""
     simplified: tuple[str, ...]
-    """What the problem lacks beside the scene."""
+    """Sentences about what `problem` lacks of `scene`."""
 
     @cached_property
     def simplified_motion(self) -> Track:
-        """The problem in this simulator."""
+        """Motion of the problem in DiffCloud's simulator."""
         return ours.simulate(self.problem, steps=self.scene.frame_steps, order=self.scene.order)
 
     @property
     def simplified_m(self) -> NDArray[np.float64]:
-        """[T] by how much what the problem lacks moves the cloth, RMS over nodes [m]; infinite where it cannot be
+        """[T] RMS distance that the simplifications of the problem cause [m]. Infinite if the problem cannot be
         simulated."""
         try:
             return distances(self.simplified_motion, Track(self.motion, 0.0))
@@ -65,16 +65,15 @@ class ExportedCloth:
 def fitted_cloth(
     recording: RecordingFit, motion: FittedMotion, scenario: Scenario, values: Mapping[str, float]
 ) -> ExportedCloth:
-    """The cloth as it was fitted, in the isotropic material that moves it most alike in this simulator.
+    """Convert a fit to an exportable cloth, with the isotropic material whose motion is most similar.
 
     Args:
-        motion: that the fit found for the recording.
-        scenario: of the recording.
-        values: of all parameters.
+        motion: fitted motion of the recording.
+        scenario: scenario of the recording.
+        values: multipliers of all parameters.
 
     Raises:
-        ConfigError: a scene that is not in SI units, one whose cloth is not the fit's, or one without anything that holds
-            the cloth all the time.
+        ConfigError: the scene is not in SI units, its mesh is not the fit's, or no node is held from start to end.
     """
     if scenario.length_unit_m != 1:
         raise ConfigError(
@@ -131,7 +130,7 @@ def _cloth(recording: RecordingFit, motion: FittedMotion, scene: Scene, strained
 
 
 def _whole(scene: Scene, problem: Problem) -> Scene:
-    """The scene in the problem's frame, with the motion that was recorded."""
+    """Return the scene in the problem's frame, with the recorded motion."""
     alike = ours.scene(problem)
     around = replace(scene.surrounding, obstacles=alike.surrounding.obstacles, moving=(), bodies=())
     own = {handle.node: handle for handle in scene.handles.handles}
@@ -156,12 +155,13 @@ def _simplified(scene: Scene) -> list[str]:
 
 
 def isotropic_sheet(material: Material, strained: float = 0.0) -> tuple[Sheet, list[str]]:
-    """The isotropic sheet nearest to a material, and what differs, in sentences.
+    """Return the isotropic sheet nearest to a material, and sentences about the differences.
 
-    The elastic tensor is projected on the isotropic ones: the mean over all directions of the cloth.
+    The elastic tensor is projected on isotropic tensors, that is, averaged over all in-plane directions.
 
     Args:
-        strained: part of the way from rest to the tables' reference strain at which the sheet is taken.
+        strained: strain at which the stiffness is taken, as a fraction of the reference strain of the material's
+            tables.
     """
     rest, reference = material.stretching[0], material.stretching[1:].mean(axis=0)
     row = (1 - strained) * rest + strained * reference
@@ -209,12 +209,12 @@ def isotropic_sheet(material: Material, strained: float = 0.0) -> tuple[Sheet, l
 
 
 def start_strain(mesh: ClothMesh) -> float:
-    """Largest Green strain of the faces where the nodes start."""
+    """Largest Green strain of the faces in the initial state."""
     return float(np.abs(_metric(mesh, mesh.nodes) - np.eye(2)).max() / 2)
 
 
 def _metric(mesh: ClothMesh, nodes: NDArray[np.float64]) -> NDArray[np.float64]:
-    """[..., F, 2, 2] C = FᵀF of the faces at nodes [..., V, 3]."""
+    """[..., F, 2, 2] metric C = FᵀF of the faces at node positions [..., V, 3]."""
     corners = nodes[..., mesh.faces, :]
     edges = np.stack([corners[..., 1, :] - corners[..., 0, :], corners[..., 2, :] - corners[..., 0, :]], axis=-1)
     gradient = edges @ np.linalg.inv(mesh.material_edges)
@@ -222,7 +222,7 @@ def _metric(mesh: ClothMesh, nodes: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _levelled(points: NDArray[np.float64], space: PoseSpace, pose: torch.Tensor) -> tuple[NDArray[np.float64], float]:
-    """Points of the recording [..., 3] without its tilt, as large as they are, and the tilt [rad]."""
+    """Remove the tilt of the recording from points [..., 3], but not its scale. Return points and tilt [rad]."""
     level = pose.clone()
     tilted = [index for index, name in enumerate(space.names) if name.startswith("tilt")]
     of_cameras = [*tilted, *(index for index, name in enumerate(space.names) if name == "scale")]
@@ -234,8 +234,7 @@ def _levelled(points: NDArray[np.float64], space: PoseSpace, pose: torch.Tensor)
 
 
 def _held(scene: Scene, motion: FittedMotion, paths: NDArray[np.float64]) -> tuple[dict[int, Motion | None], list[str]]:
-    """Node -> how it is moved, as the fitted motion has it at every step, on paths [S + 1, K, 3]; and sentences of nodes
-    that are let go."""
+    """Return held node -> motion, from paths [S + 1, K, 3], and sentences about nodes that are released."""
     times, rows = motion.held_times, {int(node): row for row, node in enumerate(motion.held)}
     absent = {handle.node for handle in scene.handles.handles} - rows.keys()
     if absent:
@@ -253,7 +252,7 @@ def _held(scene: Scene, motion: FittedMotion, paths: NDArray[np.float64]) -> tup
         if np.ptp(path, axis=0).max() < 1e-9:
             held.setdefault(handle.node, None)
         else:
-            path = np.round(path - path[0], _DIGITS)  # nodes of one pad move alike, but for rounding
+            path = np.round(path - path[0], _DIGITS)  # removes rounding differences between nodes of one pad
             keys = tuple(Keyframe(float(time), (x, y, z)) for time, (x, y, z) in zip(times, path.tolist(), strict=True))
             held[handle.node] = Motion(keys)
     loose -= held.keys()

@@ -1,7 +1,7 @@
-"""A cloth as a layer of USD with the attributes of Isaac Sim's surface deformables (Omni Physics 107 and later).
+"""Write a cloth as a USD layer with the attributes of Isaac Sim's surface deformables (Omni Physics 107 and later).
 
-Text, since the schemas are only known to Isaac Sim itself. PhysX understands E and the thickness h as a membrane with E h,
-and multiplies the bending stiffness by h³.
+The layer is written as text, because only Isaac Sim itself has the schemas. PhysX uses Young's modulus E and thickness
+h as a membrane of stiffness E h, and multiplies the bending stiffness by h³.
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ from diffcloud.simulators.problem import REST_HEIGHT, Problem
 
 
 def layer(problem: Problem, head: str, left_out: Iterable[str]) -> str:
-    """The text of a .usda file.
+    """Return the text of a .usda file.
 
     Args:
-        problem: with a Poisson's ratio below 0.5.
-        head: what the file is.
-        left_out: what it leaves out, sentences.
+        problem: problem with a Poisson's ratio below 0.5.
+        head: description of the file.
+        left_out: sentences about what the file lacks.
     """
     notes = " ".join(" ".join([head, *left_out]).split()).replace("\\", "/").replace('"', "'")
     last = len(problem.times) - 1
@@ -142,7 +142,7 @@ def _obstacle(name: str, surface: SurfaceMesh) -> list[str]:
 
 
 def _held(problem: Problem) -> list[str]:
-    """A frame that moves for each held node, and what ties the node to it."""
+    """Return an animated frame for each held node, and an attachment of the node to it."""
     lines = []
     places = problem.held_at(problem.times)
     for index, node in enumerate(problem.held):

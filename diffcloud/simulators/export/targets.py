@@ -1,6 +1,6 @@
-"""The targets of `diffcloud export`. A new one is a writer in a module of its own, and a line here.
+"""Targets of `diffcloud export`. To add a target, write a writer function and add an entry to `TARGETS`.
 
-Nothing here imports torch, so that help is quick.
+This module does not import torch, so that `--help` is fast.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ if TYPE_CHECKING:
     from diffcloud.simulators.export.cloth import ExportedCloth
 
 Writer = Callable[["ExportedCloth", Path, list[str]], tuple[list[str], list[str]]]
-"""Writes a cloth's files into a folder, with the sentences of what the cloth itself leaves out. Returns the names of the
-files, and a sentence for everything else that they leave out."""
+"""Function that writes a cloth's files into a folder. Its last argument has sentences about what the cloth itself
+lacks. It returns the file names, and sentences about what else the files lack."""
 
 
 @dataclass(frozen=True)
@@ -26,11 +26,11 @@ class Target:
     """A simulator or a file format."""
 
     about: str
-    """What the files are written for, with its version."""
+    """Name and version of the simulator or format."""
     writer: str
     """MODULE:FUNCTION of a `Writer`."""
     simplified: bool = False
-    """Whether it gets the isotropic sheet (`ExportedCloth.problem`) instead of the whole material."""
+    """True: the target gets the isotropic sheet (`ExportedCloth.problem`). False: the complete material."""
     runs: bool = False
     """Whether `--check` can run it."""
 
@@ -49,13 +49,14 @@ TARGETS: dict[str, Target] = {
     "arcsim": Target("ARCSim 0.2 and DiffSim", f"{_OWN}:arcsim_files"),
     "obj": Target("Wavefront OBJ and CSV", f"{_OWN}:obj_files"),
 }
-"""Name -> target."""
+"""Target name -> target."""
 
 
 def target_named(name: str) -> Target:
-    """
+    """Return the target of this name.
+
     Raises:
-        ConfigError: no such target.
+        ConfigError: there is no such target.
     """
     if name not in TARGETS:
         raise ConfigError(unknown_name("target", name, TARGETS))

@@ -1,4 +1,4 @@
-"""The files of each target."""
+"""Write the files of each export target."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ from diffcloud.simulators.export.targets import TARGETS, target_named
 from diffcloud.simulators.problem import Problem
 
 _MOST_POISSON = 0.49
-"""MuJoCo and Isaac Sim make a membrane of a solid, whose ratio is below 0.5; a sheet's may be larger."""
+"""Largest Poisson's ratio for MuJoCo and Isaac Sim, which treat a membrane as a solid (below 0.5)."""
 
 
 def described(one: RecordingFit, scenario: Scenario, values: Mapping[str, float]) -> dict[str, Any]:
-    """What `cloth.json` holds of a fit.
+    """Return the entries of `cloth.json` about a fit.
 
     Args:
         one: the recording whose motion is exported.
@@ -54,17 +54,17 @@ def write_samples(
     folder: Path,
     about: Mapping[str, Any],
 ) -> set[str]:
-    """The same cloth with other parameters, each in a folder `sample_0000` and so on.
+    """Export the same cloth with sampled parameters, in folders `sample_0000` and so on.
 
     Args:
         drawn: multipliers of all parameters, for each sample.
-        about: what else each `cloth.json` shall hold.
+        about: additional entries of each `cloth.json`.
 
     Returns:
-        The files, as paths inside of the folder.
+        Paths of the files relative to the folder.
 
     Raises:
-        SceneError: as of `write_export`.
+        SceneError: see `write_export`.
     """
     written = set[str]()
     for number, values in enumerate(drawn):
@@ -75,17 +75,17 @@ def write_samples(
 
 
 def write_export(cloth: ExportedCloth, target: str, folder: Path, about: Mapping[str, Any]) -> tuple[list[str], list[str]]:
-    """Write the target's files, and `cloth.json`, which says what they are.
+    """Write the files of the target, and `cloth.json`, which describes them.
 
     Args:
-        about: what else `cloth.json` shall hold.
+        about: additional entries of `cloth.json`.
 
     Returns:
-        Names of the files, and what of the cloth they leave out.
+        File names, and sentences about what the files lack of the cloth.
 
     Raises:
-        ConfigError: no such target.
-        SceneError: what ARCSim's files cannot say.
+        ConfigError: there is no such target.
+        SceneError: ARCSim's files cannot represent the scene.
     """
     chosen = target_named(target)
     left_out = [*cloth.left_out, *(cloth.simplified if chosen.simplified else ())]
@@ -116,7 +116,7 @@ def write_export(cloth: ExportedCloth, target: str, folder: Path, about: Mapping
 
 
 def exported_files(folder: Path) -> set[str]:
-    """Files of the exports that a folder and its samples hold: what a new one may take the place of. None of any other."""
+    """List the exported files in a folder and its samples, which a new export may overwrite."""
     names = set[str]()
     for record in [folder / "cloth.json", *folder.glob("sample_[0-9][0-9][0-9][0-9]/cloth.json")]:
         try:
@@ -130,7 +130,7 @@ def exported_files(folder: Path) -> set[str]:
 
 
 def for_mujoco(problem: Problem) -> tuple[Problem, mujoco.Settings]:
-    """The problem as MuJoCo's explicit steps bear it, and their settings."""
+    """Return the problem with damping that MuJoCo's explicit steps allow, and MuJoCo's settings."""
     settings, sheet = mujoco.stable(_as_solid(problem))
     return replace(problem, sheet=sheet), settings
 

@@ -1,2 +1,2 @@
-"""Scripts that run a cloth in another simulator without diffcloud: copied beside what `diffcloud export` writes, and what
-`mujoco` and `newton` in this package call."""
+"""Scripts that run a cloth in another simulator without diffcloud. `diffcloud export` copies them beside its output,
+and the modules `mujoco` and `newton` call them."""

@@ -4,8 +4,8 @@
     python run_mujoco.py              writes nodes.npz: nodes [T, V, 3] [m] at times [T] [s]
     python run_mujoco.py --view       shows it instead; writes nothing
 
-To put the cloth into a model of your own, copy <asset>, <worldbody>, <deformable> and <option> of cloth.xml, and call
-`advance` instead of mj_step, with where your gripper holds the nodes.
+To use the cloth in your own model, copy <asset>, <worldbody>, <deformable> and <option> of cloth.xml. Instead of
+mj_step, call `advance` with the positions in which your gripper holds the nodes.
 """
 
 import argparse
@@ -17,12 +17,12 @@ import numpy as np
 
 
 def advance(model, data, held, now, after):
-    """One step, in which the held nodes go from where they are to where they should be.
+    """Make one time step in which the held nodes move to their next positions.
 
     Args:
         held: indices of the K held nodes.
-        now: [K, 3] where they are [m].
-        after: [K, 3] where they should be after the step [m].
+        now: [K, 3] current positions [m].
+        after: [K, 3] positions after the step [m].
     """
     positions_of, velocities_of = node_places(model)
     data.qpos[positions_of[held]] = now - model.body_pos[node_bodies(model)[held]]
@@ -31,29 +31,29 @@ def advance(model, data, held, now, after):
 
 
 def node_bodies(model):
-    """[V] the body of each node of the cloth, which may share the model with other flexes."""
+    """[V] body index of each node of the cloth. The model may have other flexes too."""
     cloth = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_FLEX, "cloth")
     first = model.flex_vertadr[cloth]
     return model.flex_vertbodyid[first : first + model.flex_vertnum[cloth]]
 
 
 def node_places(model):
-    """[V, 3] of each node in qpos, and in qvel: it slides along three axes."""
+    """[V, 3] indices of each node in qpos and in qvel, for its three slide joints."""
     bodies = node_bodies(model)
     joints = model.body_jntadr[bodies]
     return model.jnt_qposadr[joints][:, None] + np.arange(3), model.body_dofadr[bodies][:, None] + np.arange(3)
 
 
 def positions(model, data):
-    """[V, 3] of all nodes [m]."""
+    """[V, 3] positions of all nodes [m]."""
     return model.body_pos[node_bodies(model)] + data.qpos[node_places(model)[0]]
 
 
 def frames(model, data, held, wanted, every):
-    """Yields [V, 3] nodes [m] at the start and after every so many steps.
+    """Yield node positions [V, 3] [m] at the start and after every `every` steps.
 
     Args:
-        wanted: [S + 1, K, 3] where the held nodes are before and after each step [m].
+        wanted: [S + 1, K, 3] positions of the held nodes at the start and after each step [m].
     """
     yield positions(model, data)
     for number in range(len(wanted) - 1):

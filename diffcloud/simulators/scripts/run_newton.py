@@ -3,9 +3,9 @@
     pip install newton==1.8.0 warp-lang==1.19.0 numpy
     python run_newton.py              writes nodes.npz: nodes [T, V, 3] [m] at times [T] [s]
 
-To put the cloth into a model of your own, call `add_cloth` with your builder before anything else that has
-particles, then its `color(include_bending=True)`, `finish_cloth` with the finalized model, and move the held nodes in every
-step as `frames` does.
+To use the cloth in your own model, call `add_cloth` with your builder before you add anything else that has particles.
+Then call the builder's `color(include_bending=True)`, and `finish_cloth` with the finalized model. In each step, move
+the held nodes as `frames` does.
 """
 
 import argparse
@@ -16,13 +16,13 @@ import numpy as np
 import warp
 
 CONTACT_STIFFNESS = 100.0
-"""[N/m] A node of a light towel sinks in by 0.03 mm."""
+"""Contact stiffness [N/m]. A node of a light towel penetrates by 0.03 mm."""
 CONTACT_DAMPING = 0.02
-"""[N·s/m] Of the explicit solver, whose nodes bounce without."""
+"""Contact damping of the explicit solver [N·s/m]. Without damping, nodes would bounce."""
 FRICTION_GAIN = 10.0
-"""[N·s/m] Of the explicit solver: a node that sticks creeps by less than 0.1 mm/s."""
+"""Friction gain of the explicit solver [N·s/m]. A sticking node creeps by less than 0.1 mm/s."""
 STICKING_SPEED = 1e-3
-"""[m/s] Of VBD."""
+"""Speed below which nodes stick in VBD [m/s]."""
 
 
 def add_cloth(builder, cloth, explicit=False):
@@ -34,7 +34,7 @@ def add_cloth(builder, cloth, explicit=False):
         explicit: whether the explicit solver will run the model. Its elastic constants differ from those of VBD.
     """
     shear, lateral, damping = (float(cloth[name]) for name in ("shear", "lateral", "damping"))
-    gain = float(cloth["membrane_gain"])  # makes up for a membrane that is too soft at large strains
+    gain = float(cloth["membrane_gain"])  # compensates a membrane that is too soft at large strains
     builder.add_cloth_mesh(
         pos=warp.vec3(0.0),
         rot=warp.quat_identity(),
@@ -44,9 +44,9 @@ def add_cloth(builder, cloth, explicit=False):
         indices=cloth["faces"].ravel().tolist(),
         density=float(cloth["density"]),
         tri_ke=gain * shear,
-        # the explicit solver's λ is that of its energy, VBD's that of small strains
+        # λ in the explicit solver is the coefficient in its energy; in VBD it is that of small-strain theory.
         tri_ka=gain * (lateral + (shear if explicit else 0.0)),
-        # VBD multiplies rates of FᵀF = 2 E + 1; the explicit solver those of F, which resists rigid rotation too
+        # VBD damps the rate of FᵀF = 2 E + 1. The explicit solver damps the rate of F, and so rigid rotation too.
         tri_kd=shear * damping * (2.0 if explicit else 0.5),
         tri_drag=0.0,
         tri_lift=0.0,
@@ -68,29 +68,29 @@ def add_cloth(builder, cloth, explicit=False):
 
 
 def finish_cloth(model, cloth, explicit=False):
-    """Set what a builder does not take: the cloth's friction, and the bending stiffness and rest angle of each edge.
+    """Set properties that a builder does not accept: friction of the cloth, and stiffness and rest angle of each edge.
 
-    An edge's energy is K θ²/2: VBD has k l θ²/2, so k = K/l; the explicit solver pushes with k l² θ where the gradient of θ
-    asks for K θ/height, so k = K/(l (a0 + a1)) where both faces have one size.
+    The energy of an edge is K θ²/2. VBD uses k l θ²/2, so k = K/l. The explicit solver applies the force k l² θ, where
+    the gradient of θ would need K θ/height. So k = K/(l (a0 + a1)) for two faces of the same size.
     """
-    model.particle_grid = None  # nodes do not repel each other as balls
+    model.particle_grid = None  # no repulsion between nodes as spheres
     model.soft_contact_mu, model.soft_contact_ke = float(cloth["friction"]), CONTACT_STIFFNESS
     model.soft_contact_kd, model.soft_contact_kf = CONTACT_DAMPING if explicit else 0.0, FRICTION_GAIN
     stiffness = cloth["hinge_stiffness"] / (cloth["hinge_length"] * (cloth["hinge_area"] if explicit else 1.0))
-    # an edge is found by its two nodes; those of other cloths, and at the boundary, stay as the builder has them
+    # Find edges by their two nodes. Boundary edges and edges of other cloths keep the builder's values.
     there, own = (np.sort(pairs, axis=1) for pairs in (model.edge_indices.numpy()[:, 2:], cloth["hinge_edges"]))
     numbers = (pairs[:, 0].astype(np.int64) * model.particle_count + pairs[:, 1] for pairs in (there, own))
     _, edges, rows = np.intersect1d(*numbers, return_indices=True)
     bending, rest = model.edge_bending_properties.numpy().copy(), model.edge_rest_angle.numpy().copy()
     bending[edges] = stiffness[rows, None] * np.array([1.0, float(cloth["damping"])])
     model.edge_bending_properties.assign(bending)
-    if not cloth["shaped"]:  # the builder takes the angles in which the cloth starts
+    if not cloth["shaped"]:  # by default, the builder uses the initial shape as rest shape
         rest[edges] = 0.0
         model.edge_rest_angle.assign(rest)
 
 
 def build(cloth, explicit=False, gradient=False):
-    """The cloth alone as a model, on the CPU."""
+    """Build a model of the cloth alone, on the CPU."""
     builder = newton.ModelBuilder(gravity=(0.0, 0.0, -float(cloth["gravity"])))
     add_cloth(builder, cloth, explicit)
     if not explicit:
@@ -114,11 +114,11 @@ def solver_of(model, cloth, explicit=False, iterations=10):
 
 
 def frames(model, solver, cloth, wanted, step, every):
-    """Yields [V, 3] nodes [m] at the start and after every so many steps.
+    """Yield node positions [V, 3] [m] at the start and after every `every` steps.
 
     Args:
-        wanted: [S + 1, K, 3] where the held nodes are before and after each step [m].
-        step: [s]
+        wanted: [S + 1, K, 3] positions of the held nodes at the start and after each step [m].
+        step: time step [s].
     """
     now, after, control = model.state(), model.state(), model.control()
     touches = np.isfinite(cloth["table"]) or len(cloth["body_faces"])
@@ -127,7 +127,7 @@ def frames(model, solver, cloth, wanted, step, every):
     yield np.array(cloth["nodes"])
     for number in range(1, len(wanted)):
         now.clear_forces()
-        now.particle_q.numpy()[held] = wanted[number]  # on the CPU this is the array itself
+        now.particle_q.numpy()[held] = wanted[number]  # on the CPU, numpy() shares memory with the array
         now.particle_qd.numpy()[:] *= slowed
         if contacts is not None:
             model.collide(now, contacts)
