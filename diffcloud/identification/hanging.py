@@ -211,8 +211,10 @@ def _ways(cloud: Floats, size: tuple[float, float]) -> list[dict[str, Any]]:
         straight = {"side": side, "rim_m": middle.tolist(), "yaw_deg": yaw}
         ways += [{"held": held, **straight} for held in ("edge", "corners")]
         for span in {round(s, 3) for s in (0.8, 0.9, (right - left) / length) if 0.35 < s < _TAUT}:
-            ways += [{"held": "corners", **straight, "span": span, "yaw_deg": yaw + turn} for turn in (0.0, 180.0)]
-    return [*ways, *({"held": "corner", "rim_m": highest.tolist(), "yaw_deg": yaw + turn} for turn in (0.0, 180.0))]
+            ways += [{"held": "corners", **straight, "span": span, "yaw_deg": (yaw + turn) % 360} for turn in (0.0, 180.0)]
+    # a cloth at a corner folds to one of several equilibria, which lie at different turns
+    turns = np.arange(0.0, 360.0, 45.0)
+    return [*ways, *({"held": "corner", "rim_m": highest.tolist(), "yaw_deg": (yaw + turn) % 360} for turn in turns)]
 
 
 def _aligned(options: HangScenario, cloud: Floats) -> _Hypothesis:

@@ -14,6 +14,7 @@ from diffcloud.io.episodes import Episode
 from diffcloud.io.stamps import corrected_stamps
 from diffcloud.scene.scenarios import built_in
 from diffcloud.scene.scenarios.hang import HangScenario, hang_scenario
+from diffcloud.sim.motion import Keyframe, Motion
 from diffcloud.sim.simulate import rollout
 from tests.cli.invoke import invoke
 
@@ -51,12 +52,15 @@ def recorded(truth: HangScenario, seed: int = 0, points: int = 500) -> Episode:
         motion = rollout(system, scenario.steps)
     times = np.arange(scenario.frames + 1) / truth.rate_hz
     nodes = motion.at(torch.as_tensor(times))[0].numpy()
-    path = np.array(truth.path, dtype=float)
-    track = (
-        np.stack([np.interp(times, path[:, 0], path[:, axis]) for axis in (1, 2, 3)], axis=1) + truth.rim_m + [0, 0, 0.085]
-    )
+    track = tool(truth, times)
     clouds = [surface(one, system.mesh.faces, points, rng) for one in nodes]
     return Episode.from_frames(clouds, times, gripper=track[:, None])
+
+
+def tool(truth: HangScenario, times: np.ndarray) -> np.ndarray:
+    """[T, 3] a tool 85 mm above the held part, which it moves."""
+    path = Motion(tuple(Keyframe(time, (x, y, z)) for time, x, y, z in truth.path))
+    return path.at(times)[1] + truth.rim_m + [0, 0, 0.085]
 
 
 def cloth_of(episode: Episode, size: tuple[float, float]) -> dict:
@@ -104,7 +108,7 @@ class TestLayout:
         assert found["held"] in (held, truth.held)
         if held != "corner":
             assert found["side"] == truth.side
-        assert np.linalg.norm(np.subtract(found["rim_m"], truth.rim_m)) < 0.012
+        assert np.linalg.norm(np.subtract(found["rim_m"], truth.rim_m)) < (0.04 if held == "corner" else 0.012)
         assert "it follows the gripper without turning" in layout.warnings[0]
 
     def test_the_size_is_seen(self):
@@ -168,10 +172,7 @@ def test_the_command_fits_a_folder_of_clouds_and_a_track_of_another_rate(tmp_pat
         cloud[::50] = np.nan
         np.save(folder / f"cloud_{100 + time:.4f}.npy", cloud)
     times = np.arange(0, 3.5, 0.017)
-    path = np.array(truth.path, dtype=float)
-    moved = (
-        np.stack([np.interp(times, path[:, 0], path[:, axis]) for axis in (1, 2, 3)], axis=1) + truth.rim_m + [0, 0, 0.085]
-    )
+    moved = tool(truth, times)
     rows = [f"{100 + t:.5f},{x:.6f},{y:.6f},{z:.6f}" for t, (x, y, z) in zip(times, moved, strict=True)]
     (folder / "gripper.csv").write_text("\n".join(["t_s,x,y,z", *rows]) + "\n")
     out = tmp_path / "fit"
