@@ -28,7 +28,9 @@ from diffcloud.clouds.surface import NO_GUESS, find_on_surface
 from diffcloud.errors import DiffCloudError, EpisodeError
 from diffcloud.evaluation.markdown import markdown_table
 from diffcloud.io.arrays import read_npz
+from diffcloud.io.episodes import Episode
 from diffcloud.io.files import write_bytes, write_text
+from diffcloud.io.stamps import stamp_lags
 from diffcloud.mesh import grid_cloth
 from diffcloud.sim import Properties, Rollout, System, rollout, rollout_tangents, scaled_properties
 from diffcloud.sim.build import build_system
@@ -53,10 +55,8 @@ _DENSITY = 0.2
 """[kg/m²] Assumed: the motion depends on the ratios of added mass and drag to it."""
 _MOVES = 0.03
 """[m/s] A slower bar stands still."""
-_EDGE = 0.006
-"""[m] Standard deviation of the height and place of a cloud's first row against the bar."""
-_JITTER, _LATE = 0.04, 0.01
-"""[s] Standard deviations: of one frame's lag about what its publication says, and of the lag that all frames share."""
+_LATE = 0.01
+"""[s] Standard deviation of the lag that all frames share."""
 _STRETCHING, _BENDING, _DAMPING = 60.0, 1e-5, 0.02
 """[N/m], [N·m], [s] Usual of woven cloth; the motion hardly depends on them."""
 _NOISE = 0.012
@@ -109,12 +109,19 @@ def read_recording(path: Path) -> Recording:
     held = tool[first, None] + np.einsum("kij,nj->kni", (turn * turn[0].inv()).as_matrix(), offsets)
     moving = _moving(times, held.mean(1))
     seen: NDArray[np.bool_] = np.asarray(np.isfinite(clouds).all(-1))
-    first_rows = [_means(clouds[:, row], seen[:, row]) for row in (slice(0, _ROWS), slice(_ROWS, 2 * _ROWS))]
-    edge = 1.5 * first_rows[0] - 0.5 * first_rows[1]  # points are in the middles of the cells of a grid over the cloth
-    usable = np.isfinite(edge).all(1)
+    usable = seen.sum(1) > _ROWS
     if usable.sum() < 2:
-        raise EpisodeError(f"{path} has {usable.sum()} clouds with points near the bar; two or more are needed.")
-    taken = retimed(published[usable], edge[usable, 1:], times, held.mean(1)[:, 1:])
+        raise EpisodeError(f"{path} has {usable.sum()} clouds with more than {_ROWS} points; two or more are needed.")
+    stamps = published[usable]
+    episode = Episode.from_frames(
+        [cloud[one] for cloud, one in zip(clouds[usable], seen[usable], strict=True)],
+        stamps - stamps[0],
+        gripper=_at(stamps, times, held.mean(1))[:, None],
+    )
+    lags = stamp_lags(episode)
+    if lags is None:
+        raise EpisodeError(f"The bar of {path} moves too little to tell when its clouds were taken.")
+    taken = stamps - lags.seconds
     clouds, seen = clouds[usable], seen[usable]
     steps: Floats = _STEP * np.arange(1.0, int(times[-1] / _STEP) + 1)
     used = (taken > moving[0]) & (taken < steps[-1])
@@ -136,42 +143,6 @@ def _means(points: Floats, seen: NDArray[np.bool_]) -> Floats:
     """[F, 3] of the points [F, N, 3] that are seen; NaN where none is."""
     with np.errstate(invalid="ignore"):
         return np.asarray(np.where(seen[..., None], points, 0.0).sum(1) / seen.sum(1)[:, None])
-
-
-def retimed(published: Floats, edge: Floats, times: Floats, bar: Floats) -> Floats:
-    """When clouds were taken: where the bar was where a cloud shows its own upper edge.
-
-    A cloud is published when the one before it is out of the way, so the time since then says how late it is. A line
-    through lags over these times is the expectation, from which a frame's own lag deviates by `_JITTER`; where the bar
-    stands still, it alone counts.
-
-    Args:
-        published: [F] [s].
-        edge: [F, 2] (y, z) of the upper edge [m], beside the bar's by an unknown offset.
-        times, bar: [K], [K, 2] of the bar.
-
-    Returns:
-        [F] [s]
-    """
-    since = np.minimum(np.diff(published, prepend=2 * published[0] - published[1]), 0.25)
-    away = [edge - _at(published - lag, times, bar) for lag in np.arange(0.0, 0.8, 0.005)]
-    spreads = [np.abs(one - np.median(one, axis=0)).mean() for one in away]
-    lag, offset = 0.005 * int(np.argmin(spreads)), np.median(away[int(np.argmin(spreads))], axis=0)
-    expected, jitter, found = np.full(len(published), lag), 3 * _JITTER, published - lag
-    for _ in range(5):
-        tried = (published - expected)[:, None] + np.arange(-0.3, 0.301, 0.005)
-        apart = (edge[:, None] - _at(tried, times, bar) - offset) / _EDGE
-        cost = (apart**2).sum(-1) + ((tried - (published - expected)[:, None]) / jitter) ** 2
-        found = np.take_along_axis(tried, cost.argmin(1)[:, None], 1)[:, 0]
-        offset = np.median(edge - _at(found, times, bar), axis=0)
-        speed = np.linalg.norm(_at(found + 0.02, times, bar) - _at(found - 0.02, times, bar), axis=1) / 0.04
-        lags = published - found
-        sure = speed > 0.2
-        if sure.sum() < 10:
-            break
-        sure &= np.abs(lags - np.median(lags[sure])) < 0.15
-        expected, jitter = np.polyval(np.polyfit(since[sure], lags[sure], 1), since), _JITTER
-    return found
 
 
 def swing(times: Floats, values: Floats) -> tuple[float, float]:

@@ -69,8 +69,7 @@ def corrected_stamps(episode: Episode) -> tuple[Episode, Lags | None]:
     """
     if episode.gripper is None or episode.frame_count < _FEW:
         return episode, None
-    track = CubicSpline(episode.times, episode.gripper.mean(axis=1))
-    found = _lags(episode, track)
+    found = stamp_lags(episode)
     if found is None or np.median(found.seconds) < _LATE_S:
         return episode, None
     taken = episode.times - found.seconds
@@ -102,8 +101,14 @@ def upper_end(points: NDArray[np.floating]) -> Floats:
     )
 
 
-def _lags(episode: Episode, track: CubicSpline) -> Lags | None:
-    stamps = episode.times
+def stamp_lags(episode: Episode) -> Lags | None:
+    """How late each cloud of a hanging cloth is stamped; None where the gripper moves too little to tell.
+
+    Args:
+        episode: with the track of one gripper, in metres, z up.
+    """
+    assert episode.gripper is not None
+    stamps, track = episode.times, CubicSpline(episode.times, episode.gripper.mean(axis=1))
     ends = np.stack([upper_end(episode.frame(frame)) for frame in range(episode.frame_count)])
 
     def away(times: Floats) -> Floats:

@@ -38,22 +38,6 @@ def recording(values=VALUES, seed=0):
     return study.Recording("made", times, np.ascontiguousarray(points), np.ones((40, 64), bool), start, track, 4.4)
 
 
-def test_a_cloud_gets_the_time_at_which_the_bar_was_where_its_edge_is():
-    """Published 0.2 s after it was taken and 0.7 of the time since the one before, with a jitter of 20 ms."""
-    rng = np.random.default_rng(1)
-    times = np.arange(0.0, 5.6, 0.04)
-    published = 0.3 + np.cumsum(rng.uniform(0.06, 0.22, 32))
-    since = np.diff(published, prepend=published[0] - 0.12)
-    taken = published - (0.2 + 0.7 * since + rng.normal(0, 0.02, 32))
-    edge = np.stack([np.interp(taken, times, bar(times)[:, k]) for k in (1, 2)], 1) + np.array([0.03, -0.02])
-    found = study.retimed(published, edge + rng.normal(0, 0.002, edge.shape), times, bar(times)[:, 1:])
-    swings = (taken > 0.5) & (taken < 4.3)
-    assert np.abs(found - taken)[swings].mean() < 0.012
-    assert np.abs(found - taken)[~swings].mean() < 0.03  # the bar stands still: what publication says
-    common = published - np.median(published - taken)
-    assert np.abs(common - taken)[swings].mean() > 2 * np.abs(found - taken)[swings].mean()
-
-
 @pytest.mark.parametrize(("period", "decay"), [(0.93, 0.1), (1.085, 0.7), (1.3, 1.2)])
 def test_a_damped_oscillation_has_its_period_and_decay(period, decay):
     times = np.sort(np.random.default_rng(2).uniform(3.0, 5.5, 25))
@@ -132,7 +116,7 @@ class TestFiles:
             ({"cloud_times": np.ones(40)}, "times that do not increase"),
             ({"tool_quaternions_xyzw": np.zeros((128, 4))}, "quaternions of length zero"),
             ({"tool_positions": np.zeros((128, 3))}, "The bar moves at 0.000 m/s at most"),
-            ({"clouds": np.full((40, 64, 3), np.nan)}, "clouds with points near the bar"),
+            ({"clouds": np.full((40, 64, 3), np.nan)}, "clouds with more than 8 points"),
             ({"clouds": np.array([None])}, "is not a readable recording of a hanging cloth"),
         ],
     )
