@@ -7,7 +7,7 @@ export PATH := $(CURDIR)/$(BIN):$(PATH)
 # the tests start hundreds of processes; without byte code each would compile the package again
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: venv repro test tests test-slow test-longest lint format bench acceptance comparison simulated recordings moved coverage coverage-quick coverage-own hanging robustness pictures docs clean
+.PHONY: venv repro baselines test tests test-slow test-longest lint format bench acceptance comparison simulated recordings moved coverage coverage-quick coverage-own hanging robustness pictures docs clean
 
 venv: $(STAMP)
 
@@ -33,6 +33,11 @@ ifdef PROFILE
 	cp "$(PROFILE)" params.yaml
 endif
 	dvc repro
+
+# the pipeline with search baselines, a loss landscape and twice the simulated sets, as one experiment of DVC
+baselines: venv
+	dvc exp run -S 'evaluate.baselines=[middle,random_search,cma_es]' -S 'evaluate.landscapes=[lift/lift_hidden1]' \
+	    -S generate.train=128 -S generate.test=32
 
 # one process per core and one more (tests/conftest.py), each with one thread: a step gains nothing from a second one
 TESTS := python -m pytest -n auto --maxprocesses 8 --dist worksteal
