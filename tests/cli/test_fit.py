@@ -416,7 +416,7 @@ class TestScene:
         """Seen from a camera, with poses of the tool at another rate; and `fit` without a tool says what is missing."""
         track = np.loadtxt("recorded/first/gripper.csv", delimiter=",", skiprows=1)
         monkeypatch.setattr(ros_clouds, "cloud", lambda number: read_cloud(Path(f"recorded/first/{number:03d}.ply")))
-        monkeypatch.setattr(ros_clouds, "tool_at", lambda t: [np.interp(t, track[:, 0], track[:, axis]) for axis in (1, 2, 3)])
+        monkeypatch.setattr(ros_clouds, "tool_at", lambda t: [np.interp(t, track[:, 0], axis) for axis in track.T[1:]])
         ros_clouds.CloudBag(work / "first").write(tool=lambda bag, t, place: bag.pose_stamped("/tool_pose", t, place))
         ros_clouds.CloudBag(work / "alone").write()
         episodes, cloth, layouts = find_scene([Path("first")], Path("found"), SIZE, 0.25)

@@ -174,7 +174,7 @@ class TestFrames:
 
         recording(tmp_path, clouds={"/points": ("hand_optical_frame", PLAIN, 0.0)}, tool=carried)
         episode, warnings = imported(tmp_path)
-        assert "1 of 6 clouds were left out: tf moves 'hand_optical_frame' in 'base_link'" in warnings[0]
+        assert "1 of 6 clouds were left out: /points: tf moves 'hand_optical_frame' in 'base_link'" in warnings[0]
         assert episode.frame_count == 5
         assert not episode.viewpoints
         for number in range(5):  # the nearest transform is 20 ms away at most
@@ -201,7 +201,7 @@ class TestTwoCameras:
         """Clouds nearest in time belong together, and each point names its camera."""
         recording(tmp_path, clouds=self.CLOUDS, empty=(2,))
         episode, warnings = imported(tmp_path, "--topic", "/left/points", "--topic", "/right/points")
-        assert [text[:30] for text in warnings] == ["1 of 6 clouds were left out: t"] * 2
+        assert [text[:53] for text in warnings] == ["1 of 6 clouds were left out: bag: no finite point on "] * 2
         assert episode.frame_count == FRAMES - 1
         count = len(cloud(0))
         for frame, number in enumerate((0, 1, 3, 4, 5)):
@@ -261,7 +261,7 @@ class TestTool:
     def test_that_covers_a_part(self, tmp_path):
         recording(tmp_path, tool=lambda bag, t, place: by_pose(bag, t, place) if t > START + 0.13 else None)
         episode, warnings = imported(tmp_path)
-        assert "2 of 6 clouds were left out: The clouds are from 1700000000.00 to 1700000000.50 s" in warnings[0]
+        assert "2 of 6 clouds were left out: bag: the clouds are from 1700000000.00 to 1700000000.50 s" in warnings[0]
         check_track(episode, range(2, FRAMES))
 
     def test_on_another_clock(self, tmp_path):
@@ -301,7 +301,20 @@ class TestStamps:
 
     def test_no_clouds_or_none_with_points(self, tmp_path):
         recording(tmp_path, empty=range(FRAMES))
-        assert "No cloud on /cloth/points has a finite point. Record the topic again" in refused(tmp_path)
+        assert "No cloud can be used: bag: no finite point on /cloth/points. Record the topic again" in refused(tmp_path)
+
+    def test_topics_without_a_message(self, tmp_path):
+        """Announced, but never sent."""
+
+        def announce(bag):
+            for topic, kind in (("/tool_pose", "geometry_msgs/msg/PoseStamped"), ("/more", "sensor_msgs/msg/PointCloud2")):
+                bag._writer.add_connection(topic, kind, typestore=bag._store)
+
+        recording(tmp_path, also=announce)
+        for topic in ("/tool_pose", "/more"):
+            named = ("--topic", topic, "--topic", "/cloth/points")
+            assert f"bag has no message on {topic}. Name another topic" in refused(tmp_path, *named)
+        check_track(imported(tmp_path, "--topic", "/cloth/points")[0])
 
 
 def test_points_in_millimetres_are_refused(tmp_path, monkeypatch):

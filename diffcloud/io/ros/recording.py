@@ -262,6 +262,8 @@ def first_pass(paths: Sequence[Path], shown: str, named: Sequence[str], *, cloud
                         "recording."
                     )
             own.append((stamp_s(message), 1e-9 * arrival))
+    if silent := sorted((surfaces | (poses & set(named))) - stamps.keys()):
+        raise EpisodeError(f"{shown} has no message on {silent[0]}. Name another topic, or record this one again.")
     refuse_conflicts([(topic, item) for topic, _, item in transforms], shown)
     static = {topic for topic in stamps if topic.endswith("tf_static")}
     times, warnings = message_times({topic: held for topic, held in stamps.items() if topic not in static})

@@ -119,17 +119,14 @@ def ros_clouds(
     if track is not None:
         inside = (times >= track.times[0]) & (times <= track.times[-1])
         why = (
-            f"The clouds are from {times[0]:.2f} to {times[-1]:.2f} s, the tool's poses ({track.name}) from "
+            f"the clouds are from {times[0]:.2f} to {times[-1]:.2f} s, the tool's poses ({track.name}) from "
             f"{track.times[0]:.2f} to {track.times[-1]:.2f} s"
         )
-        _refuse_none(shown, inside, f"{why}. Record both at the same time, with one clock")
-        warnings += _left_out(inside, why)
+        _leave_out(~inside, f"{shown}: {why}", "Record both at the same time, with one clock", warnings)
         times, rows = times[inside], {name: own[inside] for name, own in rows.items()}
         warnings += [] if (gap := track.gap(times)) is None else [gap]
-    elsewhere = [
-        held.frame for held in cameras.values() if _OPTICAL not in held.frame or tree.moving_stamps(base, held.frame)
-    ]
-    places = {} if elsewhere else {name: held.poses[0, :3, 3].tolist() for name, held in cameras.items()}
+    seen = all(_OPTICAL in held.frame and not tree.moving_stamps(base, held.frame) for held in cameras.values())
+    places = {name: held.poses[0, :3, 3].tolist() for name, held in cameras.items()} if seen else {}
     told: dict[str, Any] = {
         "source": f"ros recording {shown}",
         **({"viewpoints": places} if places else {}),
@@ -176,26 +173,22 @@ def _clouds(shown: str, scan: Scan, topic: str, tree: TransformTree, base: str, 
     Raises:
         EpisodeError: no cloud is left, a clock that was set back, or tf does not connect their frame with the base.
     """
-    if topic not in scan.images:
-        raise EpisodeError(f"{shown}: there is no message on {topic}. Record the topic while the cloth moves.")
     held = scan.images[topic]
     order, late = sorted_stamps(topic, held.stamps)
     if late:
         warnings.append(f"{topic}: {late} of {len(held.stamps)} clouds arrived out of order, and were sorted.")
     if len(order) < len(held.stamps):
         warnings.append(f"{topic}: {len(held.stamps) - len(order)} clouds have the stamp of another, and were left out.")
-    full = np.array([len(held.clouds[number]) > 0 for number in order])
-    _refuse_none(shown, full, f"No cloud on {topic} has a finite point. Record the topic again")
-    warnings += _left_out(full, f"they have no finite point ({topic})")
-    order = order[full]
+    empty = np.array([len(held.clouds[number]) == 0 for number in order])
+    _leave_out(empty, f"{shown}: no finite point on {topic}", "Record the topic again", warnings)
+    order = order[~empty]
     times = held.stamps[order]
     poses = poses_in_base(topic, tree, base, held.frame, times)
     known = np.full(len(times), True)
     for stamps in tree.moving_stamps(base, held.frame):
         known &= (times >= stamps[0] - _LATEST_POSE_S) & (times <= stamps[-1] + _LATEST_POSE_S)
-    why = f"tf moves {held.frame!r} in {base!r}, and has no transform at their times"
-    _refuse_none(shown, known, f"{topic}: {why}. Record /tf during the whole motion")
-    warnings += _left_out(known, f"{why} ({topic})")
+    why = f"{topic}: tf moves {held.frame!r} in {base!r}, and has no transform at their times"
+    _leave_out(~known, why, "Record /tf during the whole motion", warnings)
     return _Clouds(topic, held.frame, times[known], [held.clouds[number] for number in order[known]], poses[known])
 
 
@@ -208,9 +201,8 @@ def _frames(shown: str, cameras: Mapping[str, _Clouds], warnings: list[str]) -> 
     first = min(cameras.values(), key=lambda held: len(held.times))
     rows = {name: nearest(first.times, held.times)[0] for name, held in cameras.items()}
     whole = np.all([own >= 0 for own in rows.values()], axis=0)
-    why = "another camera has no cloud within half a frame interval"
-    _refuse_none(shown, whole, f"Of every cloud on {first.topic}, {why}. Record all cameras at once, with one clock")
-    warnings += _left_out(whole, f"{why} ({first.topic})")
+    why = f"{shown}: another camera than {first.topic} has no cloud within half a frame interval"
+    _leave_out(~whole, why, "Record all cameras at once, with one clock", warnings)
     return first.times[whole], {name: own[whole] for name, own in rows.items()}
 
 
@@ -263,15 +255,13 @@ def _with_cameras(
     return replace(episode, camera=np.repeat(numbers, np.ravel(counts)), meta=meta)
 
 
-def _refuse_none(shown: str, kept: NDArray[np.bool_], why: str) -> None:
-    """
+def _leave_out(lost: NDArray[np.bool_], why: str, advice: str, warnings: list[str]) -> None:
+    """Add a warning that some clouds [T] are left out.
+
     Raises:
-        EpisodeError: nothing is kept.
+        EpisodeError: all of them are.
     """
-    if not kept.any():
-        raise EpisodeError(f"{shown}: {why}.")
-
-
-def _left_out(kept: NDArray[np.bool_], why: str) -> list[str]:
-    count = int((~kept).sum())
-    return [f"{count} of {len(kept)} clouds were left out: {why}."] if count else []
+    if lost.all():
+        raise EpisodeError(f"No cloud can be used: {why}. {advice}.")
+    if lost.any():
+        warnings.append(f"{int(lost.sum())} of {len(lost)} clouds were left out: {why}.")
