@@ -18,6 +18,7 @@ from diffcloud.sensing.cameras import inverse
 from tests.cli.invoke import invoke, stage
 from tests.docs.examples import Example, examples, read
 from tests.estimation.test_fit import clouds_of
+from tests.io.ros_clouds import CloudBag
 from tests.io.test_recordings import bag
 from tests.sensing.charuco_scene import gripper_poses
 from tests.sensing.cloth_scene import INTRINSICS, views, write_cloth_episode
@@ -42,7 +43,8 @@ def params(folder: Path, name: str = "params.yaml") -> None:
 
 
 def own_clouds(folder: Path) -> None:
-    """my_clouds/ with gripper.csv of the tutorial's towel: its nodes, where a run puts them."""
+    """my_clouds/ with gripper.csv of the tutorial's towel: its nodes, where a run puts them; and a ROS bag of clouds."""
+    CloudBag(folder / "lift.bag", "rosbag1").write(tool=lambda held, t, place: held.pose_stamped("/tool_pose", t, place))
     towel = next(example for example in examples(read("docs/own-clouds.md")) if example.words == ("towel.yaml",))
     write(towel, folder)
     invoke("simulate", "towel.yaml", "--out", "true.npz")
