@@ -43,8 +43,7 @@ def params(folder: Path, name: str = "params.yaml") -> None:
 
 
 def own_clouds(folder: Path) -> None:
-    """my_clouds/ with gripper.csv of the tutorial's towel: its nodes, where a run puts them; and a ROS bag of clouds."""
-    CloudBag(folder / "lift.bag", "rosbag1").write(tool=lambda held, t, place: held.pose_stamped("/tool_pose", t, place))
+    """my_clouds/ with gripper.csv of the tutorial's towel: its nodes, where a run puts them."""
     towel = next(example for example in examples(read("docs/own-clouds.md")) if example.words == ("towel.yaml",))
     write(towel, folder)
     invoke("simulate", "towel.yaml", "--out", "true.npz")
@@ -54,6 +53,11 @@ def own_clouds(folder: Path) -> None:
         write_ply(folder / "my_clouds" / f"{index:03d}.ply", frame)
     track = np.column_stack([times, nodes[:, -1]])
     np.savetxt("my_clouds/gripper.csv", track, delimiter=",", header="t_s,x,y,z", comments="")
+
+
+def cloud_bag(folder: Path) -> None:
+    """lift.bag, a ROS recording of clouds with the tool's poses."""
+    CloudBag(folder / "lift.bag", "rosbag1").write(tool=lambda held, t, place: held.pose_stamped("/tool_pose", t, place))
 
 
 def lift_episode(folder: Path) -> None:
@@ -150,6 +154,7 @@ def example(folder: Path) -> None:
 
 PREPARED = {
     "README.md": example,
+    "docs/own-clouds.md": cloud_bag,
     "docs/library.md": own_clouds,
     "docs/calibration.md": board,
     "docs/concepts.md": motions,

@@ -14,7 +14,7 @@ from diffcloud.io.episodes import read_episode
 from diffcloud.io.ros.messages import MOST_POINTS, cloud_points
 from diffcloud.sensing.robot import gen3
 from tests.cli.invoke import invoke
-from tests.io.ros_bag import ARM, START
+from tests.io.ros_bag import ARM, START, Bag
 from tests.io.ros_clouds import BASE_CAMERA, FRAMES, OPTICAL, PLAIN, CloudBag, Layout, cloud, tool_at
 from tests.sensing.table_scene import HOME_RAD
 
@@ -127,6 +127,10 @@ class TestLayouts:
             fields = [SimpleNamespace(name=one, offset=at, datatype=7, count=1) for one, at, _ in XYZ]
             with suppress(EpisodeError):
                 assert cloud_points(SimpleNamespace(fields=fields, **told), "/a").shape[1] == 3
+
+    def test_an_empty_message_is_an_empty_cloud(self):
+        sizes = dict.fromkeys(("height", "width", "point_step", "row_step"), 0)
+        assert cloud_points(SimpleNamespace(fields=[], data=np.zeros(0), **sizes), "/a").shape == (0, 3)
 
     def test_too_many_points_are_refused(self, tmp_path, monkeypatch):
         monkeypatch.setattr("diffcloud.io.ros.recording.MOST_POINTS", 1000)
@@ -315,6 +319,35 @@ class TestStamps:
             named = ("--topic", topic, "--topic", "/cloth/points")
             assert f"bag has no message on {topic}. Name another topic" in refused(tmp_path, *named)
         check_track(imported(tmp_path, "--topic", "/cloth/points")[0])
+
+
+class Both(CloudBag):
+    """Depth images and clouds."""
+
+    write = Bag.write
+
+    def _tf(self, t):
+        super()._tf(t)
+        self.points("/cloth/points", "base_link", PLAIN, 0, t)
+
+
+def test_depth_images_are_preferred_unless_clouds_are_named(tmp_path):
+    Both(tmp_path / "bag").write()
+    done = invoke("data", "import", tmp_path / "bag", "--out", tmp_path / "raw")
+    assert done.result["kind"] == "ros"
+    assert any("the clouds on /cloth/points were not. If the clouds show only" in text for text in done.result["warnings"])
+    episode, _ = imported(tmp_path, "--topic", "/cloth/points")
+    np.testing.assert_allclose(episode.frame(3), cloud(0), atol=1e-6)
+    depth = "/side/aligned_depth_to_color/image_raw"
+    said = refused(tmp_path, "--topic", "/cloth/points", "--topic", depth)
+    assert f"--topic names clouds (/cloth/points) and depth images ({depth}). A recording is read by one" in said
+
+
+def test_a_part_of_a_split_recording_is_refused(tmp_path):
+    for number in range(2):
+        CloudBag(tmp_path / f"lift_{number}.bag", "rosbag1").write(tool=by_tf)
+    said = invoke("data", "import", tmp_path / "lift_1.bag", "--out", tmp_path / "e.npz", code=1).errors
+    assert "lift_1.bag is one of the 2 parts of a split recording" in said
 
 
 def test_points_in_millimetres_are_refused(tmp_path, monkeypatch):

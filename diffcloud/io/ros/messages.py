@@ -133,6 +133,9 @@ def cloud_points(message: Any, topic: str) -> NDArray[np.floating[Any]]:
     Raises:
         EpisodeError: no x, y, z as floats, or sizes that contradict each other or the data.
     """
+    height, width, step, row = message.height, message.width, message.point_step, message.row_step
+    if height * width == 0:  # often without fields
+        return np.zeros((0, 3))
     names = [held.name for held in message.fields]
     found = [axis_field(names, axis) for axis in "xyz"]
     fields = [message.fields[index] for index in found if index is not None]
@@ -149,7 +152,6 @@ def cloud_points(message: Any, topic: str) -> NDArray[np.floating[Any]]:
                 f"The field {held.name} of the clouds on {topic} is {kind}, {held.count} per point. Coordinates are one "
                 "float32 or float64 per point, in metres. Convert the clouds, and record them again."
             )
-    height, width, step, row = message.height, message.width, message.point_step, message.row_step
     if height * width > MOST_POINTS:
         raise EpisodeError(
             f"A cloud on {topic} states {height} x {width} points. A recording may have {MOST_POINTS:,}. If the message is "
