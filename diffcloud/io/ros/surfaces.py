@@ -117,21 +117,11 @@ def ros_clouds(
     times, rows = _frames(shown, cameras, warnings)
     track = _track(shown, scan, source, tree, base, times, joint_names, topics, tool_pose, warnings)
     if track is not None:
-        inside = (times >= track.times[0]) & (times <= track.times[-1])
-        why = (
-            f"the clouds are from {times[0]:.2f} to {times[-1]:.2f} s, the tool's poses ({track.name}) from "
-            f"{track.times[0]:.2f} to {track.times[-1]:.2f} s"
-        )
-        _leave_out(~inside, f"{shown}: {why}", "Record both at the same time, with one clock", warnings)
+        inside = _covered(shown, track, times, warnings)
         times, rows = times[inside], {name: own[inside] for name, own in rows.items()}
-        warnings += [] if (gap := track.gap(times)) is None else [gap]
     seen = all(_OPTICAL in held.frame and not tree.moving_stamps(base, held.frame) for held in cameras.values())
     places = {name: held.poses[0, :3, 3].tolist() for name, held in cameras.items()} if seen else {}
-    told: dict[str, Any] = {
-        "source": f"ros recording {shown}",
-        **({"viewpoints": places} if places else {}),
-        **(meta or {}),
-    }
+    told = {"source": f"ros recording {shown}", **({"viewpoints": places} if places else {}), **(meta or {})}
     episode = Episode.from_frames(
         [np.concatenate([cameras[name].placed(row[frame]) for name, row in rows.items()]) for frame in range(len(times))],
         times - times[0],
@@ -240,6 +230,22 @@ def _track(
         "tool's frame by --tool-frame of `diffcloud data import`."
     )
     return None
+
+
+def _covered(shown: str, track: ToolTrack, times: Floats, warnings: list[str]) -> NDArray[np.bool_]:
+    """[T] which times lie between the first and the last pose of the tool.
+
+    Raises:
+        EpisodeError: none does.
+    """
+    inside = (times >= track.times[0]) & (times <= track.times[-1])
+    why = (
+        f"{shown}: the clouds are from {times[0]:.2f} to {times[-1]:.2f} s, the tool's poses ({track.name}) from "
+        f"{track.times[0]:.2f} to {track.times[-1]:.2f} s"
+    )
+    _leave_out(~inside, why, "Record both at the same time, with one clock", warnings)
+    warnings += [] if (gap := track.gap(times[inside])) is None else [gap]
+    return np.asarray(inside)
 
 
 def _with_cameras(
