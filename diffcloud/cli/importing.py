@@ -26,8 +26,8 @@ def import_(
     out: Annotated[
         Path,
         typer.Option(
-            help="Clouds: episode file (.npz). Recordings: folder of the raw episode; must not exist. Published data: "
-            "folder; episodes go to OUT/release_<lift|fold|band|hang>/."
+            help="Clouds, also of ROS: episode file (.npz). Recordings: folder of the raw episode; must not exist. "
+            "Published data: folder; episodes go to OUT/release_<lift|fold|band|hang>/."
         ),
     ],
     kind: Annotated[
@@ -50,8 +50,8 @@ def import_(
     camera: Annotated[
         list[str] | None,
         typer.Option(
-            help="Clouds: NAME=X,Y,Z in metres, in the frame of the clouds, for every camera. Fits leave out what none of "
-            "them could see."
+            help="Clouds, also of ROS: NAME=X,Y,Z in metres, in the frame of the clouds, for every camera. Fits leave out "
+            "what none of them could see."
         ),
     ] = None,
     label: Annotated[
@@ -104,6 +104,7 @@ def import_(
         import_clouds,
         import_recording,
         import_release,
+        import_ros_clouds,
         named,
         refuse_others,
         ros_choices,
@@ -111,7 +112,7 @@ def import_(
         viewpoints,
     )
 
-    found = source_kind(source, kind)
+    found = source_kind(source, kind, topic or ())
     given = {
         "--gripper": gripper, "--rate-hz": rate_hz, "--camera": camera, "--label": label, "--joint-log": joint_log,
         "--clock-offset": clock_offset, "--world-frame": world_frame, "--tool-frame": tool_frame, "--joints": joints,
@@ -123,10 +124,13 @@ def import_(
         result = import_release(source[0], out, trajectories)
     elif found == "clouds":
         result = import_clouds(source[0], out, gripper, rate_hz, labels, viewpoints(camera))
+    elif found == "ros_clouds":
+        choices = ros_choices(world_frame, tool_frame, joints, None, topic, urdf)
+        result = import_ros_clouds(list(named(source).values()), out, choices, labels, viewpoints(camera))
     else:
         if clock_offset is not None and joint_log is None:
             raise ConfigError("--clock-offset shifts the times of a joint log, and none is given. Give --joint-log too.")
-        choices = partial(ros_choices, world_frame, tool_frame, joints, gripper_joint, topic, urdf)
+        later = partial(ros_choices, world_frame, tool_frame, joints, gripper_joint, topic, urdf)
         offset = clock_offset or 0.0
-        result = import_recording(named(source), out, found, choices, rate_hz, joint_log, offset, labels, play_recordings)
+        result = import_recording(named(source), out, found, later, rate_hz, joint_log, offset, labels, play_recordings)
     finish({"out": str(out), "kind": found, **result}, json)

@@ -23,8 +23,8 @@ Topics = Annotated[
     list[str] | None,
     typer.Option(
         "--topic",
-        help="ROS: which topic to take where several could be: of depth, colour, camera_info, joint states or tf; "
-        "repeated. TOPIC#NUMBER takes one of several publishers of joint states on it.",
+        help="ROS: which topic to take where several could be: of clouds, depth, colour, camera_info, the tool's pose, "
+        "joint states or tf; repeated. TOPIC#NUMBER takes one of several publishers of joint states on it.",
     ),
 ]
 JsonFlag = Annotated[bool, typer.Option("--json", help="End standard output with one JSON object.")]

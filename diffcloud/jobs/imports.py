@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, ExitStack
 from dataclasses import replace
 from functools import partial
@@ -28,10 +28,12 @@ from diffcloud.io.numbers import number
 from diffcloud.io.published import RECORDED_START_M, read_trajectories, recorded_episode
 from diffcloud.io.recordings import Recording, read_joint_log, write_recording
 from diffcloud.io.ros.recording import ros_recording
+from diffcloud.io.ros.surfaces import is_cloud_recording, ros_clouds
 from diffcloud.io.urdf import RobotDescription, read_urdf
 from diffcloud.sensing.agreement import agreement, corrected
 from diffcloud.sensing.filters import without_strays
 from diffcloud.sensing.fusion import FusionSettings
+from diffcloud.sensing.tool_poses import turning
 from diffcloud.sensing.visible_region import with_cut_planes
 
 _FARTHEST_M = 50.0
@@ -40,6 +42,7 @@ _KINDS = {
     "clouds": "a folder of clouds",
     "release": "the published data",
     "ros": "a ROS recording",
+    "ros_clouds": "a ROS recording of clouds",
     "realsense": "a RealSense recording",
     "folder": "a depth folder",
 }
@@ -47,17 +50,17 @@ _KINDS = {
 _RECORDINGS = ("ros", "realsense", "folder")
 _OF = {
     "--gripper": ("clouds",),
-    "--camera": ("clouds",),
+    "--camera": ("clouds", "ros_clouds"),
     "--rate-hz": ("clouds", "folder"),
-    "--label": ("clouds", *_RECORDINGS),
+    "--label": ("clouds", "ros_clouds", *_RECORDINGS),
     "--joint-log": _RECORDINGS,
     "--clock-offset": _RECORDINGS,
-    "--world-frame": ("ros",),
-    "--tool-frame": ("ros",),
-    "--joints": ("ros",),
+    "--world-frame": ("ros", "ros_clouds"),
+    "--tool-frame": ("ros", "ros_clouds"),
+    "--joints": ("ros", "ros_clouds"),
     "--gripper-joint": ("ros",),
-    "--topic": ("ros",),
-    "--urdf": ("ros",),
+    "--topic": ("ros", "ros_clouds"),
+    "--urdf": ("ros", "ros_clouds"),
     "--trajectories": ("release",),
 }
 """Option -> kinds of sources for which it is valid."""
@@ -65,13 +68,15 @@ _IMAGE_SIGNS = ("depth", "camera.json", "intrinsics.json", "camera_intrinsic.jso
 """File and folder names that identify a depth folder."""
 
 
-def source_kind(sources: list[Path], stated: str | None = None) -> str:
-    """Return the kind of the sources: clouds, release, ros, realsense or folder (of depth images).
+def source_kind(sources: list[Path], stated: str | None = None, topics: Sequence[str] = ()) -> str:
+    """Return the kind of the sources: clouds, release, ros, ros_clouds, realsense or folder (of depth images).
 
     Args:
         stated: clouds, recording or release, instead of detection. None: detect the kind from the files.
+        topics: topics that the user chose in a ROS recording.
 
     Raises:
+        EpisodeError: a ROS recording is not readable.
         ConfigError: the kind is unknown, the sources have several kinds, or the kind allows only one folder.
     """
     paths = named(sources).values()
@@ -91,6 +96,8 @@ def source_kind(sources: list[Path], stated: str | None = None) -> str:
             )
         if not sources[0].exists():  # NAME=PATH
             raise ConfigError(f"{sources[0]}: only recordings of several cameras have names. Give the folder alone.")
+    if kind == "ros" and is_cloud_recording(list(paths), topics):
+        return "ros_clouds"
     return kind
 
 
@@ -171,12 +178,61 @@ def import_clouds(
     """Write a folder of clouds and gripper tracks as an episode. Return the file name and counts."""
     meta: dict[str, Any] = {**labels, **({"viewpoints": viewpoints} if viewpoints else {})}
     episode = cloud_folder(folder, grippers=named_files(gripper) if gripper else None, rate_hz=rate_hz, meta=meta)
+    _refuse_far(episode, folder)
+    return _write_clouds(out, episode)
+
+
+@writes(".npz")
+def import_ros_clouds(
+    paths: list[Path], out: Path, choices: dict[str, Any], labels: dict[str, str], viewpoints: dict[str, list[float]]
+) -> dict[str, Any]:
+    """Write a ROS recording of clouds as an episode; file, counts and warnings, for the result."""
+    meta: dict[str, Any] = {**labels, **({"viewpoints": viewpoints} if viewpoints else {})}
+    episode, warnings = cloud_recording(paths, {**choices, "meta": meta})
+    return {**_write_clouds(out, episode), "warnings": warnings}
+
+
+def cloud_recording(paths: list[Path], choices: dict[str, Any]) -> tuple[Episode, list[str]]:
+    """A ROS recording of clouds as an episode, and the warnings, which are printed.
+
+    Args:
+        choices: what `ros_choices` returns, and `meta`.
+
+    Raises:
+        EpisodeError: as `ros_clouds`.
+        ConfigError: points that are too far away to be in metres.
+    """
+    described = choices.pop("description")
+
+    def tool_pose(joints_rad: NDArray[np.float64]) -> NDArray[np.float64]:
+        from diffcloud.sensing.robot import TOOL_LINK, Robot  # not above: it brings torch
+
+        return Robot(described(), choices.get("tool_frame") or TOOL_LINK).tool_pose(joints_rad)
+
+    found = ros_clouds(*paths, tool_pose=tool_pose, **choices)
+    turned = turning(found.tool_quaternions)
+    warnings = [*found.warnings, *([] if turned is None else [turned])]
+    for message in warnings:
+        warn(message)
+    errors.print(found.summary)
+    _refuse_far(found.episode, paths[0])
+    return found.episode, warnings
+
+
+def _refuse_far(episode: Episode, source: Path) -> None:
+    """
+    Raises:
+        ConfigError: points that are too far away to be in metres.
+    """
     far = float(np.abs(episode.points).max())
     if far > _FARTHEST_M:
         raise ConfigError(
-            f"{folder}: points lie up to {far:.0f} m from the origin. Clouds are in metres, in the robot's frame; divide "
+            f"{source}: points lie up to {far:.0f} m from the origin. Clouds are in metres, in the robot's frame; divide "
             "millimetres by 1000."
         )
+
+
+def _write_clouds(out: Path, episode: Episode) -> dict[str, Any]:
     write_episode(out, episode)
     errors.print(f"Wrote {episode.frame_count} frames, {len(episode.points)} points to {out}.")
     return {"out": str(out), "frames": episode.frame_count, "points": len(episode.points)}

@@ -110,9 +110,14 @@ def _is_bag(path: Path) -> bool:
 def read_recording(path: Path, name: str, out: Path, topics: Sequence[str], *, keep: bool) -> Episode:
     """Read a recording as an episode. See `read_all`."""
     kept = out / "episodes" / f"{name}.npz"
-    if _is_bag(path):
+    clouds = _is_bag(path) and _holds_clouds(path, topics)
+    if _is_bag(path) and not clouds:
         path = _unpacked(path, out / "recordings" / name, topics)
-    if path.is_file():
+    if clouds:
+        from diffcloud.jobs.imports import cloud_recording, ros_choices
+
+        episode, _ = cloud_recording([path], ros_choices(None, None, None, None, list(topics), None))
+    elif path.is_file():
         episode = read_episode(path)
         if not keep:
             return episode
@@ -128,6 +133,14 @@ def read_recording(path: Path, name: str, out: Path, topics: Sequence[str], *, k
         episode = cloud_folder(path, grippers={"gripper": track})
     write_episode(kept, episode)
     return episode
+
+
+def _holds_clouds(bag: Path, topics: Sequence[str]) -> bool:
+    """Whether a recording is read by its clouds, as by `data import`."""
+    from diffcloud.io.ros.surfaces import is_cloud_recording
+    from diffcloud.jobs.imports import recording_kind
+
+    return recording_kind(bag) == "ros" and is_cloud_recording([bag], topics)
 
 
 def _unpacked(bag: Path, folder: Path, topics: Sequence[str]) -> Path:

@@ -36,6 +36,7 @@ from diffcloud.jobs.scene_files import find_scene
 from diffcloud.scene.scenarios import built_in, make_scenario
 from diffcloud.sim.simulate import rollout
 from tests.cli.invoke import DIFFCLOUD, environment, invoke, study
+from tests.io import ros_clouds
 from tests.io.ros_bag import bag
 from tests.io.test_ros_choices import desired
 from tests.io.test_ros_choices import written as baselines
@@ -410,6 +411,25 @@ class TestScene:
         assert not Path("found/recordings.yaml").exists()
         _, cloth, _ = find_scene([Path("recorded/first")], Path("found"), None, None)
         assert cloth["size_m"] == pytest.approx(SIZE, abs=0.005)
+
+    def test_of_a_bag_of_clouds_is_that_of_their_folder(self, work, monkeypatch):
+        """Seen from a camera, with poses of the tool at another rate; and `fit` without a tool says what is missing."""
+        track = np.loadtxt("recorded/first/gripper.csv", delimiter=",", skiprows=1)
+        monkeypatch.setattr(ros_clouds, "cloud", lambda number: read_cloud(Path(f"recorded/first/{number:03d}.ply")))
+        monkeypatch.setattr(ros_clouds, "tool_at", lambda t: [np.interp(t, track[:, 0], axis) for axis in track.T[1:]])
+        ros_clouds.CloudBag(work / "first").write(tool=lambda bag, t, place: bag.pose_stamped("/tool_pose", t, place))
+        ros_clouds.CloudBag(work / "alone").write()
+        episodes, cloth, layouts = find_scene([Path("first")], Path("found"), SIZE, 0.25)
+        assert dc.load_recording("found/episodes/first.npz").frame_count == ros_clouds.FRAMES
+        assert episodes["first"].meta["source"] == "ros recording first"
+        _, from_folder, expected = find_scene([Path("recorded/first")], Path("other"), SIZE, 0.25)
+        assert cloth == from_folder
+        same = ("yaw_deg", "grasped", "center_m", "table_height_m")
+        assert [layouts["first"][key] for key in same] == [expected["first"][key] for key in same]
+        said = invoke("fit", "alone", "--out", "third", code=1).errors
+        assert "The tool's pose is unknown: there is no topic of poses" in said
+        assert "The recording has no track of its gripper" in said
+        assert not Path("third/cloth.yaml").exists()
 
     @pytest.mark.parametrize("sides", [(1.0, 1.0), (0.22, 0.18)])
     @pytest.mark.parametrize("stated", [None, "as the table"])

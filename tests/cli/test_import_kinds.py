@@ -16,6 +16,7 @@ from diffcloud.jobs.imports import _KINDS, _OF, source_kind
 from tests.cli.invoke import invoke
 from tests.docs.site import reference
 from tests.io.ros_bag import bag
+from tests.io.ros_clouds import CloudBag
 from tests.io.test_imports import make_clouds, make_release
 from tests.sensing.table_scene import write_table_episode
 
@@ -35,6 +36,9 @@ def make(kind, folder):
             return make_release(folder / "pysim")
         case "ros":
             return bag(folder, "rosbag2")
+        case "ros_clouds":
+            CloudBag(folder / "bag").write()
+            return folder / "bag"
         case "realsense":
             (folder / "side.db3").write_bytes(b"SQLite format 3\x00" + b"/device_0/sensor_0/Depth_0")
             return folder / "side.db3"

@@ -18,6 +18,7 @@ from diffcloud.sensing.cameras import inverse
 from tests.cli.invoke import invoke, stage
 from tests.docs.examples import Example, examples, read
 from tests.estimation.test_fit import clouds_of
+from tests.io.ros_clouds import CloudBag
 from tests.io.test_recordings import bag
 from tests.sensing.charuco_scene import gripper_poses
 from tests.sensing.cloth_scene import INTRINSICS, views, write_cloth_episode
@@ -52,6 +53,11 @@ def own_clouds(folder: Path) -> None:
         write_ply(folder / "my_clouds" / f"{index:03d}.ply", frame)
     track = np.column_stack([times, nodes[:, -1]])
     np.savetxt("my_clouds/gripper.csv", track, delimiter=",", header="t_s,x,y,z", comments="")
+
+
+def cloud_bag(folder: Path) -> None:
+    """lift.bag, a ROS recording of clouds with the tool's poses."""
+    CloudBag(folder / "lift.bag", "rosbag1").write(tool=lambda held, t, place: held.pose_stamped("/tool_pose", t, place))
 
 
 def lift_episode(folder: Path) -> None:
@@ -148,6 +154,7 @@ def example(folder: Path) -> None:
 
 PREPARED = {
     "README.md": example,
+    "docs/own-clouds.md": cloud_bag,
     "docs/library.md": own_clouds,
     "docs/calibration.md": board,
     "docs/concepts.md": motions,

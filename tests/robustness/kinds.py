@@ -37,6 +37,7 @@ from tests.cli.invoke import ROOT, environment
 from tests.conftest import small_lift
 from tests.estimation.test_fit import clouds_of
 from tests.io.ros_bag import Bag, Habits
+from tests.io.ros_clouds import CloudBag
 from tests.sensing.table_scene import INTRINSICS, poses
 
 SCENARIO = {
@@ -107,6 +108,7 @@ def make_project(folder: Path) -> None:
     write_file(write_files(folder), sheet_over_box())
     Bag(folder / "recording.bag", "rosbag1", Habits()).write()
     Bag(folder / "recording", "mcap", Habits()).write()
+    CloudBag(folder / "clouds.bag", "rosbag1").write(tool=lambda held, t, place: held.pose_stamped("/tool_pose", t, place))
     for kind, source in (("recorded", folder / "data" / "recorded"), ("given", folder / "data" / "episodes")):
         shutil.copytree(source, folder / "twice" / kind)
         one = next((folder / "twice" / kind).rglob("small_hidden1*"))
@@ -238,6 +240,7 @@ KINDS = (
     Kind("depth folder, image", "bytes", "images/depth/000001.png", _IMAGES),
     Kind("mesh", "bytes", "cloth.obj", lambda: read_cloth(Path("cloth.obj")), flips=80),
     Kind("ROS bag", "bytes", "recording.bag", command("data import recording.bag --out imported")),
+    Kind("ROS bag of clouds", "bytes", "clouds.bag", command("data import clouds.bag --out imported.npz")),
     Kind("MCAP", "bytes", "recording/recording.mcap", command("data import recording --out imported")),
     Kind("trajectory", "table", "path.csv", _CAPTURE),
     Kind("rig", "document", "rig.yaml", lambda: read_rig(Path("rig.yaml"))),

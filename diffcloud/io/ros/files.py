@@ -19,7 +19,7 @@ import yaml
 
 from diffcloud.errors import DiffCloudError, EpisodeError
 from diffcloud.io.inputs import check_input
-from diffcloud.io.ros.topics import is_depth
+from diffcloud.io.ros.topics import POINT_CLOUD, is_depth
 
 _METADATA = "metadata.yaml"
 _NUMBERED = re.compile(r"(.*)_(\d+)")
@@ -143,18 +143,23 @@ class _Extent:
 
     start_s: float
     end_s: float
-    depths: frozenset[str]
+    surfaces: frozenset[str]
+    """Topics of depth images and of clouds."""
 
     def adjoins(self, other: _Extent) -> bool:
         near = self.start_s <= other.end_s + _ADJOINING_S and other.start_s <= self.end_s + _ADJOINING_S
-        return near and bool(self.depths & other.depths)  # simultaneous files of different cameras are not parts
+        return near and bool(self.surfaces & other.surfaces)  # cameras recorded side by side are no parts
 
 
 def _extent(path: Path) -> _Extent | None:
     """Return the extent of a file, or None if it is not readable."""
     try:
         with opened([path]) as reader:
-            depths = frozenset(held.topic for held in reader.connections if is_depth(held.topic, held.msgtype))
-            return _Extent(1e-9 * reader.start_time, 1e-9 * reader.end_time, depths)
+            surfaces = frozenset(
+                held.topic
+                for held in reader.connections
+                if is_depth(held.topic, held.msgtype) or held.msgtype == POINT_CLOUD
+            )
+            return _Extent(1e-9 * reader.start_time, 1e-9 * reader.end_time, surfaces)
     except EpisodeError:
         return None

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from diffcloud.errors import EpisodeError
 from diffcloud.io.camera_models import LENS_COEFFICIENTS, Distortion, Intrinsics
 from diffcloud.io.images import decode_color, decode_depth
+from diffcloud.io.pcd import axis_field
 from diffcloud.io.rvl import decode_rvl
 
 DepthEncoding = Literal["16UC1", "32FC1"]
@@ -30,6 +31,13 @@ _LENSES: dict[str, Distortion] = {
 """ROS distortion model -> ours. Similar models share an entry, because OpenCV distinguishes them by the number of
 coefficients and drivers name them inconsistently."""
 _COLOR_CHANNELS = {"rgb8": (0, 1, 2), "bgr8": (2, 1, 0), "rgba8": (0, 1, 2), "bgra8": (2, 1, 0), "mono8": (0, 0, 0)}
+
+_POINT_TYPES = ("int8", "uint8", "int16", "uint16", "int32", "uint32", "float32", "float64")
+"""Names of the numbers 1 to 8 that a PointField has as its datatype."""
+_FLOATS = {7: "f4", 8: "f8"}
+"""Datatypes of coordinates in metres."""
+MOST_POINTS = 100_000_000
+"""Of a recording, so of one cloud too: as float32 they take 1.2 GB."""
 
 
 def stamp_s(message: Any) -> float:
@@ -116,6 +124,54 @@ def color_image(message: Any, topic: str) -> NDArray[np.uint8]:
     if message.encoding not in _COLOR_CHANNELS:
         raise EpisodeError(f"{topic} has the encoding {message.encoding!r}; colour is {', '.join(_COLOR_CHANNELS)}.")
     return np.ascontiguousarray(_pixels(message, np.dtype(np.uint8))[..., _COLOR_CHANNELS[message.encoding]])
+
+
+def cloud_points(message: Any, topic: str) -> NDArray[np.floating[Any]]:
+    """Points [N, 3] of a PointCloud2 [m], in the frame of its header; float32, or float64 if a coordinate is stored so.
+
+    Points that are not finite are left out. Organised clouds have them where a pixel has no measurement.
+
+    Raises:
+        EpisodeError: no x, y, z as floats, or sizes that contradict each other or the data.
+    """
+    height, width, step, row = message.height, message.width, message.point_step, message.row_step
+    if height * width == 0:  # often without fields
+        return np.zeros((0, 3))
+    names = [held.name for held in message.fields]
+    found = [axis_field(names, axis) for axis in "xyz"]
+    fields = [message.fields[index] for index in found if index is not None]
+    if len(fields) < 3:
+        raise EpisodeError(
+            f"The clouds on {topic} have the fields {', '.join(names) or '(none)'}. A cloud needs the fields x, y and z. "
+            "Record a topic that has them."
+        )
+    for held in fields:
+        if held.datatype not in _FLOATS or held.count > 1:  # some drivers write 0 for one number
+            known = 1 <= held.datatype <= len(_POINT_TYPES)
+            kind = _POINT_TYPES[held.datatype - 1] if known else f"of the unknown datatype {held.datatype}"
+            raise EpisodeError(
+                f"The field {held.name} of the clouds on {topic} is {kind}, {held.count} per point. Coordinates are one "
+                "float32 or float64 per point, in metres. Convert the clouds, and record them again."
+            )
+    if height * width > MOST_POINTS:
+        raise EpisodeError(
+            f"A cloud on {topic} states {height} x {width} points. A recording may have {MOST_POINTS:,}. If the message is "
+            "not damaged, record smaller clouds."
+        )
+    data = np.ascontiguousarray(message.data, np.uint8)
+    ends = [held.offset + np.dtype(_FLOATS[held.datatype]).itemsize for held in fields]
+    if len(data) != height * row or row < width * step or max(ends) > step:
+        raise EpisodeError(
+            f"A cloud on {topic} is damaged: {height} rows of {row} bytes, {width} points of {step} bytes per row, "
+            f"coordinates up to byte {max(ends)} of a point, and {len(data)} bytes of data. Rows must hold their points, "
+            "points their coordinates, and the data all rows. Record the topic again, or cut the recording there."
+        )
+    order = ">" if message.is_bigendian else "<"
+    formats, offsets = [order + _FLOATS[held.datatype] for held in fields], [held.offset for held in fields]
+    layout = np.dtype({"names": list("xyz"), "formats": formats, "offsets": offsets})
+    table = np.ndarray((height, width), layout, data, strides=(row, step))
+    points = np.stack([table[axis] for axis in "xyz"], axis=-1).reshape(-1, 3)
+    return np.asarray(points[np.isfinite(points).all(axis=1)])
 
 
 def is_calibrated(message: Any) -> bool:

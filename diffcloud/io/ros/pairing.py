@@ -49,7 +49,7 @@ def pair(camera: str, depth_topic: str, depth_s: ArrayLike, color_s: ArrayLike |
     """
     warnings: list[str] = []
     stamps = np.array(depth_s)
-    depths, late = _sorted(depth_topic, stamps)
+    depths, late = sorted_stamps(depth_topic, stamps)
     if late:
         warnings.append(f"Camera {camera}: {late} of {len(stamps)} depth images arrived out of order; they were sorted.")
     if len(depths) < len(stamps):
@@ -63,14 +63,7 @@ def pair(camera: str, depth_topic: str, depth_s: ArrayLike, color_s: ArrayLike |
     if sent is not None and not len(sent):
         warnings.append(f"Camera {camera}: its colour topic has no message, so no frame has colour.")
     elif sent is not None:
-        tolerance = _tolerance_s(times, np.sort(sent))
-        order = np.argsort(sent, kind="stable")
-        clock = sent[order]
-        after = np.searchsorted(clock, times).clip(0, len(clock) - 1)
-        before = (after - 1).clip(0)
-        nearest = np.where(np.abs(clock[before] - times) < np.abs(clock[after] - times), before, after)
-        off = np.abs(clock[nearest] - times)
-        colors = np.where(off <= tolerance, order[nearest], -1)
+        colors, off, tolerance = nearest(times, sent)
         lost = colors < 0
         if lost.any():
             warnings.append(
@@ -82,7 +75,28 @@ def pair(camera: str, depth_topic: str, depth_s: ArrayLike, color_s: ArrayLike |
     return Pairing(times, depths, colors, tuple(warnings))
 
 
-def _sorted(topic: str, stamps: Floats) -> tuple[Integers, int]:
+def nearest(times: Floats, sent: Floats) -> tuple[Integers, Floats, float]:
+    """Find the message of another stream that is nearest to each time.
+
+    Args:
+        times: [T] in order [s].
+        sent: [N] stamps of the messages in any order [s], one or more.
+
+    Returns:
+        [T] numbers of the messages, -1 where the nearest is farther than the tolerance; [T] how far it is; the tolerance,
+        half a frame interval of the slower stream, within 20 and 50 ms.
+    """
+    tolerance = _tolerance_s(times, np.sort(sent))
+    order = np.argsort(sent, kind="stable")
+    clock = sent[order]
+    after = np.searchsorted(clock, times).clip(0, len(clock) - 1)
+    before = (after - 1).clip(0)
+    chosen = np.where(np.abs(clock[before] - times) < np.abs(clock[after] - times), before, after)
+    off = np.abs(clock[chosen] - times)
+    return np.where(off <= tolerance, order[chosen], -1), off, tolerance
+
+
+def sorted_stamps(topic: str, stamps: Floats) -> tuple[Integers, int]:
     """Return message numbers sorted by stamp without duplicate stamps, and the number of messages that arrived late."""
     youngest = np.maximum.accumulate(stamps)
     behind = youngest - stamps

@@ -27,8 +27,10 @@ from diffcloud.io.ros.files import opened, refuse_lone_parts
 from diffcloud.io.ros.joints import GRIPPER_JOINT, Grip, joint_log, log_from_links
 from diffcloud.io.ros.messages import (
     DEPTH_UNITS_M,
+    MOST_POINTS,
     DepthEncoding,
     camera_intrinsics,
+    cloud_points,
     color_image,
     depth_encoding,
     depth_image,
@@ -37,10 +39,13 @@ from diffcloud.io.ros.messages import (
 )
 from diffcloud.io.ros.pairing import Pairing, pair
 from diffcloud.io.ros.publishers import JointMessage
+from diffcloud.io.ros.tool import POSES, StampedPose, stamped_pose
 from diffcloud.io.ros.topics import (
     CAMERA_INFO,
+    POINT_CLOUD,
     CameraTopics,
     aligned_by_name,
+    cloud_cameras,
     depth_cameras,
     info_topic,
     is_rectified,
@@ -52,7 +57,7 @@ from diffcloud.io.ros.transforms import TransformTree, refuse_conflicts
 from diffcloud.io.urdf import RobotDescription
 
 _JOINTS = "sensor_msgs/msg/JointState"
-_TF = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
+TF = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
 
 
 def ros_recording(
@@ -88,11 +93,16 @@ def ros_recording(
     grip = Grip.of(gripper_joint, gripper_open, gripper_closed)
     split = refuse_lone_parts(paths)
     shown = ", ".join(path.name for path in map(Path, paths))
-    scan = _scan(paths, shown, topics)
+    scan = first_pass(paths, shown, topics)
     tree = TransformTree(scan.transforms)
     cameras: dict[str, CameraInfo] = {}
     sources: dict[str, _Source] = {}
     warnings = [*split, *scan.warnings, *tree.warnings]
+    if clouds := sorted(topic for topic, kind in scan.topics.items() if kind == POINT_CLOUD):
+        warnings.append(
+            f"The depth images were taken, and the clouds on {', '.join(clouds)} were not. If the clouds show only the "
+            f"cloth, take them by `--topic {clouds[0]}`."
+        )
     for name, own in scan.cameras.items():
         info, depth = scan.infos.get(own.info), scan.images.get(own.depth)
         if info is None or depth is None:
@@ -153,18 +163,26 @@ class _Images:
     """Encoding of the first depth image. None for colour."""
     stamps: NDArray[np.float64] = field(default_factory=lambda: np.empty(0))
     """[N] stamps in order of arrival [s]."""
+    clouds: list[NDArray[np.floating[Any]]] = field(default_factory=list)
+    """Points [N, 3] of each message in the topic's frame [m]. Empty for images."""
 
 
 @dataclass
-class _Scan:
+class Scan:
     """Result of the first pass: everything except the pixels."""
 
     topics: Mapping[str, str]
     cameras: Mapping[str, CameraTopics]
+    surfaces: Mapping[str, str]
+    """Topic of clouds of each camera; empty where depth images are read."""
     infos: dict[str, Any] = field(default_factory=dict)
     images: dict[str, _Images] = field(default_factory=dict)
     joints: list[JointMessage] = field(default_factory=list)
     transforms: list[tuple[float, Any]] = field(default_factory=list)
+    poses: dict[str, list[StampedPose]] = field(default_factory=dict)
+    """By topic, in order of arrival; only where clouds are read."""
+    times: dict[str, NDArray[np.float64]] = field(default_factory=dict)
+    """Of the messages of each topic, in order of arrival [s]."""
     warnings: list[str] = field(default_factory=list)
 
 
@@ -178,21 +196,35 @@ class _Source:
     pairing: Pairing
 
 
-def _scan(paths: Sequence[Path], shown: str, named: Sequence[str]) -> _Scan:
+def first_pass(paths: Sequence[Path], shown: str, named: Sequence[str], *, clouds: bool = False) -> Scan:
+    """Read everything but the pixels.
+
+    Args:
+        shown: the recording, for messages.
+        named: topics that the user named.
+        clouds: read clouds and poses in place of depth images.
+
+    Raises:
+        EpisodeError: an unreadable recording, a damaged message, or topics as of `ros_recording`.
+    """
     stamps: dict[str, list[tuple[float, float]]] = {}
     joints: list[tuple[str, str, int, Any]] = []
     transforms: list[tuple[str, int, Any]] = []
+    points = 0
     with opened(paths) as reader:
         topics = {held.topic: held.msgtype for held in reader.connections}
         refuse_unknown(topics, named, shown)
-        scan = _Scan(topics, depth_cameras(topics, shown, named))
+        scan = Scan(
+            topics,
+            {} if clouds else depth_cameras(topics, shown, named),
+            cloud_cameras(topics, shown, named) if clouds else {},
+        )
         depths = {camera.depth for camera in scan.cameras.values()}
-        images = depths | {topic for camera in scan.cameras.values() for topic in camera.colors}
-        others = only_named(topics, named, (_JOINTS,)) | only_named(topics, named, _TF)
+        surfaces, poses = set(scan.surfaces.values()), only_named(topics, named, POSES if clouds else ())
+        images = depths | surfaces | {topic for camera in scan.cameras.values() for topic in camera.colors}
+        others = only_named(topics, named, (_JOINTS,)) | only_named(topics, named, TF)
         wanted = [
-            held
-            for held in reader.connections
-            if held.topic in images or held.topic in others or held.msgtype == CAMERA_INFO
+            held for held in reader.connections if held.topic in images | poses | others or held.msgtype == CAMERA_INFO
         ]
         senders = _senders(wanted)
         for connection, arrival, raw in reader.messages(wanted):
@@ -203,26 +235,41 @@ def _scan(paths: Sequence[Path], shown: str, named: Sequence[str]) -> _Scan:
                     scan.infos[topic] = message  # keep the latest message until one is calibrated
                 continue
             own = stamps.setdefault(topic, [])
-            if kind in _TF:
+            if kind in TF:
                 for item in message.transforms:
                     transforms.append((topic, len(own), item))
                     own.append((stamp_s(item), 1e-9 * arrival))
                 continue
             if kind == _JOINTS:
                 joints.append((topic, senders[connection.id, connection.topic, id(connection.owner)], len(own), message))
+            elif topic in poses:
+                scan.poses.setdefault(topic, []).append(stamped_pose(message))
             elif topic not in scan.images:
                 scan.images[topic] = _first_image(message, topic, is_depth=topic in depths)
             elif message.header.frame_id != scan.images[topic].frame:
                 raise EpisodeError(
-                    f"{shown}: {topic} has images of two cameras, in the frames {scan.images[topic].frame!r} and "
-                    f"{message.header.frame_id!r}. Record each camera on a topic of its own."
+                    f"{shown}: {topic} has {'clouds' if clouds else 'images'} of two cameras, in the frames "
+                    f"{scan.images[topic].frame!r} and {message.header.frame_id!r}. Record each camera on a topic of its "
+                    "own."
                 )
+            if topic in surfaces:
+                cloud = cloud_points(message, topic)
+                scan.images[topic].clouds.append(cloud)
+                points += len(cloud)
+                if points > MOST_POINTS:
+                    raise EpisodeError(
+                        f"{shown} has more than {MOST_POINTS:,} points in its clouds. Record smaller clouds, or cut the "
+                        "recording."
+                    )
             own.append((stamp_s(message), 1e-9 * arrival))
+    if silent := sorted((surfaces | (poses & set(named))) - stamps.keys()):
+        raise EpisodeError(f"{shown} has no message on {silent[0]}. Name another topic, or record this one again.")
     refuse_conflicts([(topic, item) for topic, _, item in transforms], shown)
     static = {topic for topic in stamps if topic.endswith("tf_static")}
     times, warnings = message_times({topic: held for topic, held in stamps.items() if topic not in static})
     times |= {topic: np.array([stamp for stamp, _ in stamps[topic]]) for topic in static}  # valid at all times
     scan.warnings += warnings
+    scan.times = times
     for topic, held in scan.images.items():
         held.stamps = times[topic]
     scan.joints += [JointMessage(float(times[topic][row]), topic, sender, item) for topic, sender, row, item in joints]
@@ -257,13 +304,15 @@ def _refuse_other_clock(shown: str, robot: RobotLog, sources: Mapping[str, _Sour
 
 
 def _first_image(message: Any, topic: str, *, is_depth: bool) -> _Images:
+    if hasattr(message, "point_step"):
+        return _Images(message.header.frame_id, None, None)
     if is_depth:
         return _Images(message.header.frame_id, None, depth_encoding(message, topic))
     height, width = color_image(message, topic).shape[:2]
     return _Images(message.header.frame_id, (width, height), None)
 
 
-def _aligned_color(scan: _Scan, camera: CameraTopics) -> tuple[str | None, list[str]]:
+def _aligned_color(scan: Scan, camera: CameraTopics) -> tuple[str | None, list[str]]:
     """Return the camera's colour topic that is aligned with depth (or None), and warnings if colour is not aligned."""
     why_not = {}
     for topic in camera.colors:
@@ -283,7 +332,7 @@ def _aligned_color(scan: _Scan, camera: CameraTopics) -> tuple[str | None, list[
     ]
 
 
-def _unaligned(scan: _Scan, camera: CameraTopics, color: str) -> str | None:
+def _unaligned(scan: Scan, camera: CameraTopics, color: str) -> str | None:
     """Explain why a colour image is not aligned with depth, or return None if it is."""
     images, depth_info = scan.images[color], scan.infos[camera.info]
     size = (depth_info.width, depth_info.height)

@@ -14,10 +14,12 @@ from diffcloud.errors import EpisodeError
 
 IMAGE, COMPRESSED_IMAGE = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
+POINT_CLOUD = "sensor_msgs/msg/PointCloud2"
 
 _CONTENT = {
     *("image", "images", "raw", "rect", "rectified", "compressed", "compresseddepth"),
     *("depth", "color", "colour", "rgb", "aligned", "to", "registered", "hw", "sw", "float"),
+    *("points", "cloud", "pointcloud", "pointcloud2"),
 }
 """Words in topic names that describe the content, not the camera."""
 _HOLDERS = {"camera", "cameras", "cam", "cams"}
@@ -88,6 +90,45 @@ def refuse_unknown(topics: Mapping[str, str], named: Collection[str], where: str
     unknown = [name for name in named if name.partition("#")[0] not in topics]
     if unknown:
         raise EpisodeError(f"{where} has no topic {unknown[0]}, which --topic names; its topics are {_listed(topics)}.")
+
+
+def holds_clouds(topics: Mapping[str, str], named: Collection[str], where: str) -> bool:
+    """Whether a recording is read by its clouds: one of them is named, or it has no depth images.
+
+    Args:
+        topics: message type by topic.
+        named: topics that the user named.
+        where: the recording, for messages.
+
+    Raises:
+        EpisodeError: both clouds and depth images are named.
+    """
+    clouds = {topic for topic, kind in topics.items() if kind == POINT_CLOUD}
+    depths = {topic for topic, kind in topics.items() if is_depth(topic, kind)}
+    if clouds & set(named) and depths & set(named):
+        raise EpisodeError(
+            f"{where}: --topic names clouds ({_listed(clouds & set(named))}) and depth images "
+            f"({_listed(depths & set(named))}). A recording is read by one of both. Name one."
+        )
+    return bool(clouds & set(named) or (clouds and not depths))
+
+
+def cloud_cameras(topics: Mapping[str, str], where: str, named: Collection[str] = ()) -> dict[str, str]:
+    """The topic of clouds of each camera, by the camera's name.
+
+    Args:
+        topics, where, named: as of `holds_clouds`.
+
+    Raises:
+        EpisodeError: several topics of clouds, of which none is named; lists them.
+    """
+    found = sorted(only_named(topics, named, (POINT_CLOUD,)))
+    if len(found) > 1 and not set(found) <= set(named):
+        raise EpisodeError(
+            f"{where} has clouds on several topics: {_listed(found)}. Name the one with the cloth by --topic, such as "
+            f"`--topic {found[0]}`. If several cameras show the cloth, name the topic of each."
+        )
+    return dict(zip(_names([_key(topic) for topic in found]), found, strict=True))
 
 
 def depth_cameras(topics: Mapping[str, str], where: str, named: Collection[str] = ()) -> dict[str, CameraTopics]:

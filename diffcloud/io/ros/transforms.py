@@ -117,6 +117,26 @@ class TransformTree:
         up, down = self._way(target, source)
         return np.linalg.inv(self._chain(down, times)) @ self._chain(up, times)
 
+    @property
+    def frames(self) -> set[str]:
+        """All that a transform has as parent or child."""
+        return {*self._edges, *(edge.parent for edge in self._edges.values())}
+
+    def root(self, frame: str) -> str:
+        """The frame without a parent to which this one belongs."""
+        return self._above(frame)[-1]
+
+    def moving_stamps(self, target: str, source: str) -> list[Floats]:
+        """Stamps [N] [s] of each transform between two frames that changes, so not of tf_static.
+
+        Raises:
+            EpisodeError: as `lookup`.
+        """
+        return [edge.stamps for edge in self._edges_on(target, source) if np.ptp(edge.matrices, axis=0).any()]
+
+    def _edges_on(self, target: str, source: str) -> list[_Edge]:
+        return [self._edges[frame] for way in self._way(target, source) for frame in way]
+
     def stamps(self, frame: str) -> Floats:
         """[N] times at which the frame's pose relative to its parent was sent [s]. Empty if never."""
         edge = self._edges.get(_plain(frame))
@@ -128,7 +148,7 @@ class TransformTree:
         Raises:
             EpisodeError: as `lookup`, or `source` moves relative to `target`.
         """
-        stamps = [self._edges[frame].stamps for way in self._way(target, source) for frame in way]
+        stamps = [edge.stamps for edge in self._edges_on(target, source)]
         times = np.unique(np.concatenate([np.zeros(1), *stamps]))
         poses = self.lookup(target, source, times[:: 1 + len(times) // _LOOKED_AT])
         turns = Rotation.from_matrix(poses[:, :3, :3]) * Rotation.from_matrix(poses[0, :3, :3]).inv()
@@ -149,8 +169,8 @@ class TransformTree:
                 if frame in self._doubtful:
                     parents = " and ".join(map(repr, self._doubtful[frame]))
                     raise EpisodeError(f"tf puts {frame!r} into both {parents}, and which of them holds cannot be told")
-            frames = sorted({*self._edges, *(edge.parent for edge in self._edges.values())})
-            known = f"its frames are {', '.join(frames)}" if frames else "the recording has none"
+            frames = self.frames
+            known = f"its frames are {', '.join(sorted(frames))}" if frames else "the recording has none"
             raise EpisodeError(f"tf does not connect {_plain(source)!r} with {_plain(target)!r}; {known}")
         return up[: up.index(common)], down[: down.index(common)]
 
