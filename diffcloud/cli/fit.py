@@ -9,15 +9,17 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from rich.table import Table
 
 from diffcloud.cli.options import ADVANCED, JsonFlag, ParamsFile, SceneName, Threads, Topics, merged, settings_options
-from diffcloud.console import duration_s, errors, finish
+from diffcloud.console import duration_s, finish, show_panel
 from diffcloud.errors import ConfigError
 from diffcloud.estimation.settings import AdamSolver, FitSettings
 
 if TYPE_CHECKING:
     from diffcloud.estimation.task import Recording
     from diffcloud.jobs.cloth_fit import ClothFit
+    from diffcloud.reporting.page import Summary
 
 _FITTING = 0.9
 """Part of the time of --budget after which fits end: the report needs some, too."""
@@ -109,11 +111,9 @@ def fit(
                 paths = [path for path, _ in group.values()]
                 task = _found(paths, folder, sides, weighed, topic or (), settings, stored, init)
             left = None if seconds is None else max(_FITTING * seconds - (time.monotonic() - began), 1.0)
-            told, findings = task.run(left)
-            for line in findings:
-                errors.print(line, soft_wrap=True)
-            errors.print(f"Wrote {folder / 'report.html'}, {folder / 'fit.json'}.")
-            results[folder.name] = result_of(told, findings)
+            told, summary = task.run(left)
+            _show(summary, folder)
+            results[folder.name] = result_of(told, summary)
             if told.status == Status.interrupted:
                 interrupted = True
                 break
@@ -122,6 +122,23 @@ def fit(
     finish(results if separate else next(iter(results.values())), json)
     if interrupted:
         raise KeyboardInterrupt
+
+
+def _show(summary: Summary, folder: Path) -> None:
+    """Print what a person reads first, as on the first screen of the report."""
+    table = Table(*summary.parameters.heads, box=None, padding=(0, 2, 0, 0))
+    for row in summary.parameters.rows:
+        table.add_row(*(f"{cell.text} ({cell.note})" if cell.note else cell.text for cell in row))
+    steps = "\n".join(f"{index}. {step}" for index, step in enumerate(summary.next_steps, 1))
+    rows: list[tuple[str, str | Table]] = [
+        ("Status", "\n".join([summary.residual, *summary.findings])),
+        ("Parameters", table),
+        ("Held out", summary.held_out),
+        ("Next", steps),
+        ("Files", f"{folder / 'report.html'}, {folder / 'fit.json'}"),
+    ]
+    style = {True: "green", False: "red", None: "yellow"}[summary.good]
+    show_panel(summary.status, rows, style=style)
 
 
 def _members(recordings: Sequence[Path], scene: str | None) -> dict[str, tuple[Path, str | None]]:
