@@ -19,14 +19,10 @@ from diffcloud.io.files import read_json, together, write_bytes, write_text
 from diffcloud.io.tables import read_csv
 from diffcloud.jobs.fits import fit_file
 from diffcloud.jobs.settings import Config
-from diffcloud.reporting import (
-    ComparisonEntry,
-    EpisodeEntry,
-    TrainingEntry,
-    build_page,
-    comparison_figures,
-    overlay_figure,
-)
+from diffcloud.reporting.comparison import ComparisonEntry
+from diffcloud.reporting.figures import comparison_figures, overlay_figure
+from diffcloud.reporting.page import EpisodeEntry, build_page
+from diffcloud.reporting.regressors import TrainingEntry
 
 
 def write_report(

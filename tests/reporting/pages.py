@@ -10,8 +10,7 @@ import numpy as np
 from diffcloud.estimation.result import FittedMotion
 from diffcloud.io.episodes import Episode
 from diffcloud.mesh.topology import SurfaceMesh
-from diffcloud.reporting import EpisodeEntry, build_page
-from diffcloud.reporting.page import Summary
+from diffcloud.reporting.page import EpisodeEntry, Summary, build_page
 from diffcloud.reporting.uncertainty import NamedFit, parameters_table
 from tests.estimation.records import record_of, recording_of
 

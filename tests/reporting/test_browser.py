@@ -14,7 +14,8 @@ import pytest
 from diffcloud.evaluation.summary import tables
 from diffcloud.io.camera_models import Intrinsics
 from diffcloud.io.raw_episodes import CameraInfo, RawEpisodeWriter
-from diffcloud.reporting import ComparisonEntry, comparison_figures
+from diffcloud.reporting.comparison import ComparisonEntry
+from diffcloud.reporting.figures import comparison_figures
 from diffcloud.reporting.overlay import Overlay, recorded_layers
 from diffcloud.reporting.view import build_view
 from tests.evaluation.records import records
@@ -110,7 +111,7 @@ def test_the_first_screen_has_status_parameters_and_picture(page):
     """Of a window of 1280 x 800 pixels; with everything folded, a page is at most four of them."""
     page.set_viewport_size({"width": 1280, "height": 800})
     page.wait_for_timeout(300)
-    shown = [] if page.name == "view" else [".status", "#parameters tbody tr", ".findings li"]
+    shown = [".problems"] if page.name == "view" else [".status", "#parameters tbody tr", ".findings li"]
     for selector in (*shown, "#layers input", "#scene canvas"):
         assert page.locator(selector).first.bounding_box()["y"] < 800, selector
     scene = page.locator("#scene").first.bounding_box()

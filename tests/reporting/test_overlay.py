@@ -15,7 +15,7 @@ from matplotlib.axes import Axes
 from diffcloud.estimation.pose import PoseSpace
 from diffcloud.estimation.result import recorded_pose
 from diffcloud.io.episodes import Episode
-from diffcloud.reporting import overlay_figure
+from diffcloud.reporting.figures import overlay_figure
 from diffcloud.reporting.overlay import Layer, Overlay, held_layers, recorded_layers, states_at
 from diffcloud.reporting.view import build_view, scene_layers, unposed_layer
 from diffcloud.scene.scenarios import load_scenario
