@@ -46,40 +46,37 @@ def fit(
     recordings: Annotated[
         list[Path],
         typer.Argument(
-            help="Recordings of one cloth: folders of numbered clouds with a gripper.csv, raw episodes, ROS bags, episode "
-            "files. SCENE=FILE names the scene of each."
+            help="Folders of clouds with a gripper.csv, episode files, raw episodes or ROS bags. SCENE=FILE states a scene."
         ),
     ],
-    out: Annotated[Path, typer.Option(help="Folder: fit.json, intervals.json, report.html, and what was found.")],
+    out: Annotated[Path, typer.Option(help="Folder for fit.json, intervals.json, report.html and the scene.")],
     settings: Mapping[str, Any],
-    size: Annotated[str | None, typer.Option(help="Sides in metres, such as 0.40x0.30. Default: as seen.")] = None,
+    size: Annotated[str | None, typer.Option(help="Sides in m, such as 0.40x0.30. Default: from the first frame.")] = None,
     density: Annotated[
-        str | None, typer.Option(help="Weighed mass over area, in kg per square metre, such as 0.24 or 0.24+-0.01.")
+        str | None, typer.Option(help="Mass per area in kg/m², such as 0.24 or 0.24+-0.01. Default: estimated.")
     ] = None,
     scene: SceneName = None,
     budget: Annotated[
         str,
-        typer.Option(help="Time for reading, fits and report (90, 60s, 3min, 1h, none). Then the best so far is reported."),
+        typer.Option(help="Time limit, such as 90, 60s, 3min, 1h, or none."),
     ] = "5min",
     topic: Topics = None,
     init: Annotated[
         str,
         typer.Option(
-            help="First start: middle, PARAMETER=VALUE,..., or a regressor's prediction: mlp, ... or its checkpoint.",
+            help="First start: middle, PARAMETER=VALUE,..., mlp or another network, or a checkpoint.",
             rich_help_panel=ADVANCED,
         ),
     ] = "middle",
-    separate: Annotated[
-        bool, typer.Option("--separate", help="Fit each recording alone, in OUT/<recording>, instead of all together.")
-    ] = False,
-    dvc: Annotated[bool, typer.Option("--dvc", help="Make a DVC project of OUT: dvc.yaml and params.yaml.")] = False,
+    separate: Annotated[bool, typer.Option("--separate", help="Fit each recording alone, in OUT/<recording>.")] = False,
+    dvc: Annotated[bool, typer.Option("--dvc", help="Make a DVC project of OUT.")] = False,
     threads: Threads = None,
     params: ParamsFile = None,
     json: JsonFlag = False,
 ) -> None:
-    """Find the parameters of a cloth from recordings of it: layout, joint fit, intervals, and a report.
+    """Estimate the parameters of a cloth from its recordings, with intervals and a report.
 
-    Ctrl-C writes the best so far. The same command keeps what is finished and goes on.
+    Ctrl-C reports the best fit so far. The same command continues.
     """
     began = time.monotonic()
     from diffcloud.io.files import claimed

@@ -23,17 +23,16 @@ Topics = Annotated[
     list[str] | None,
     typer.Option(
         "--topic",
-        help="ROS: which topic to take where several could be: of depth, colour, camera_info, joint states or tf; "
-        "repeated. TOPIC#NUMBER takes one of several publishers of joint states on it.",
+        help="ROS: topic to use, or TOPIC#NUMBER of one of its publishers; repeatable.",
     ),
 ]
-JsonFlag = Annotated[bool, typer.Option("--json", help="End standard output with one JSON object.")]
+JsonFlag = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
 Threads = Annotated[
     int | None,
     typer.Option(
         min=1,
         max=1024,
-        help="Threads that simulate; results are the same for any number. Default: all cores.",
+        help="Threads of the simulation. Default: all cores.",
         rich_help_panel=ADVANCED,
     ),
 ]
@@ -42,7 +41,7 @@ Workers = Annotated[
     typer.Option(
         min=1,
         max=1024,
-        help="Processes, each with one thread; results are the same for any number. Default: one per core.",
+        help="Processes, each with one thread. Default: one per core.",
         rich_help_panel=ADVANCED,
     ),
 ]
@@ -50,20 +49,18 @@ Scheduler = Annotated[
     str | None,
     typer.Option(
         "--scheduler",
-        help="Address of a Dask scheduler, e.g. tcp://host:8786, whose workers see the same folders; instead of --workers.",
+        help="Address of a Dask scheduler, such as tcp://host:8786, instead of --workers. It needs the same folders.",
         rich_help_panel=ADVANCED,
     ),
 ]
 ParamsFile = Annotated[
     Path | None,
-    typer.Option(
-        "--params", help="YAML with a section for this command; options given here win.", rich_help_panel=ADVANCED
-    ),
+    typer.Option("--params", help="YAML file of settings. Options override it.", rich_help_panel=ADVANCED),
 ]
 StageParams = Annotated[Path | None, typer.Option("--params", help="YAML with a section for each stage.")]
 SCENE_HELP = (
-    "lift, fold, band_stretch, vest_hang, shake, recorded_lift, recorded_fold, a YAML file, the name of one in raw/scenes, "
-    "an ARCSim scene JSON, or release_lift=FILE.json (release_fold, release_hang, release_band) for a published one."
+    "YAML or ARCSim JSON file, or lift, fold, band_stretch, vest_hang, shake, recorded_lift, recorded_fold, or "
+    "release_lift=FILE.json (release_fold, release_hang, release_band)."
 )
 SceneName = Annotated[str | None, typer.Option("--scene", help=SCENE_HELP)]
 

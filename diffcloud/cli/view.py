@@ -49,17 +49,13 @@ def view(
     ],
     out: Annotated[Path, typer.Option(help="HTML file.")] = Path("view.html"),
     scene: SceneName = None,
-    fit: Annotated[Path | None, typer.Option(help="JSON of a fit to these episodes: its motion and pose.")] = None,
-    frames: Annotated[int, typer.Option(min=1, max=1000, help="Of an episode that are shown, evenly spread.")] = 60,
-    points: Annotated[int, typer.Option(min=1, max=100_000, help="Of a cloud that are shown.")] = 2000,
-    live: Annotated[
-        bool, typer.Option("--live", help="Follow a raw episode in a browser while it is recorded. Ctrl-C stops watching.")
-    ] = False,
-    calibration: Annotated[
-        Path | None, typer.Option(help="Of --live: calibration file. Default: what camera.json says.")
-    ] = None,
+    fit: Annotated[Path | None, typer.Option(help="fit.json of a fit to these recordings.")] = None,
+    frames: Annotated[int, typer.Option(min=1, max=1000, help="Frames shown of a recording, evenly spread.")] = 60,
+    points: Annotated[int, typer.Option(min=1, max=100_000, help="Points shown of a cloud.")] = 2000,
+    live: Annotated[bool, typer.Option("--live", help="Follow a raw episode while it is recorded. Ctrl-C stops.")] = False,
+    calibration: Annotated[Path | None, typer.Option(help="With --live: calibration file. Default: camera.json.")] = None,
     port: Annotated[
-        int, typer.Option(min=1024, max=65535, help="Of --live; if it is taken, the next free one is used.")
+        int, typer.Option(min=1024, max=65535, help="With --live: port. If it is in use, the next free one.")
     ] = 8080,
     open_: Annotated[bool, typer.Option("--open", help="Open the page in a browser.")] = False,
     params: ParamsFile = None,

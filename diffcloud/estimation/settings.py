@@ -78,32 +78,29 @@ class FitSettings(Section):
     """Of a fit."""
 
     parameters: Names = ["stretching", "density"]
-    """Parameters to find, comma-separated, such as stretching,bending,density."""
+    """Parameters to estimate, such as stretching,bending,density."""
     bounds: dict[str, Bounds] = Field(default={}, json_schema_extra={"flag": "--bound"})
-    """Range of a parameter, NAME=LOW:HIGH, repeatable. Default: the scene's."""
+    """Range of a parameter, NAME=LOW:HIGH; repeatable."""
     fixed: dict[str, Component] = Field(default={}, json_schema_extra={"flag": "--fix"})
-    """A parameter that is known, NAME=VALUE, repeatable."""
+    """Known value of a parameter; repeatable."""
     solver: Solver = LikelihoodSolver()
-    """likelihood, with intervals; adam, the paper's; cma_es or random_search, without derivatives."""
+    """likelihood (with intervals), adam (the paper's), cma_es or random_search."""
     points: Count | None = None
     """Points that are sampled on the cloth in each frame. Default: the scene's."""
     frames: Annotated[list[Annotated[int, Field(ge=-100_000, le=100_000)]], Field(min_length=1)] | None = None
     """Frames to compare, such as 0,5,10. Default: all usable ones."""
     seed: Seed = 0
-    """Of all random numbers."""
+    """Seed of all random numbers."""
     loss: Literal["surface", "paper"] = "surface"
-    """surface: both directions, all frames. paper: from cloth to recording only, squared, at the scene's loss frames."""
+    """surface: both directions, all frames. paper: one-sided, as in the paper."""
     alignment: Name | None = None
-    """Parts of the recording's pose and clock to find, with their standard deviation: x=2cm,yaw=5deg,lag=50ms. Of x, y, z,
-    tilt_x, tilt_y, yaw, lag, scale; or none. Default: all but scale."""
+    """Pose variables and their standard deviations, such as x=2cm,yaw=5deg,lag=50ms; or none. Default: all but scale."""
     initial_state: Name | None = None
-    """How the cloth may lie at first: turn=5deg, shape=5mm, size=2%, track=2%; or none. Default: what the scene says, for
-    likelihood with a smooth integrator."""
+    """Its standard deviations: turn=5deg,shape=5mm,size=2%,track=2%; or none."""
     prior: Name | None = None
-    """The factor within which each multiplier probably lies, such as bending=3x; or none. Default: 10x."""
+    """Standard deviations of parameters, such as bending=3x; or none. Default: 10x."""
     uncertain: Name | None = None
-    """Other material that is fitted too, each within a factor: bending=1.5x,air_density=1.3x; or none. Default: the
-    scene's, for likelihood with a smooth integrator."""
+    """Nuisance material and its standard deviations, such as bending=1.5x; or none."""
     joint: bool = False
     """One parameter set for all recordings, of one cloth."""
     level: Level = LEVEL
