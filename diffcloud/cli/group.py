@@ -54,8 +54,8 @@ def _imported(name: str, place: str) -> Any:
     command.name = name
     for param in command.params:
         shown = param.display_type_rich
-        param.display_type_rich = lambda ctx, shown=shown: _short_type(shown(ctx))
-        param._get_number_range_help_str = lambda: ""
+        vars(param)["display_type_rich"] = lambda ctx, shown=shown: _short_type(shown(ctx))
+        vars(param)["_get_number_range_help_str"] = lambda: ""
     return command
 
 

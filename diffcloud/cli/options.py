@@ -126,11 +126,18 @@ def merged(settings: Section, typed: Mapping[str, Any]) -> Any:
     try:
         return kind.model_validate(told)
     except ValidationError as error:
-        faults = [
-            f"{_flag_of(kind, fault['loc'], typed)}: {fault['msg'].removeprefix('Value error, ')}"
-            for fault in error.errors()
-        ]
+        faults = [_said(_flag_of(kind, fault["loc"], typed), fault) for fault in error.errors()]
         raise ConfigError("; ".join(faults) + ".") from error
+
+
+def _said(flag: str, fault: Any) -> str:
+    """Return an option, what is allowed, and what was found, of one fault of a validator."""
+    if fault["type"] == "extra_forbidden":
+        return f"{flag} does not apply to the chosen solver. Omit it, or choose another --solver"
+    text = fault["msg"].removeprefix("Value error, ").replace("Input should be", "must be")
+    found = fault["input"]
+    got = f" (got {found!r})" if isinstance(found, str | int | float) and "got " not in text else ""
+    return f"{flag}: {text}{got}" if flag else text.replace("bounds.", "--bound ") + got
 
 
 def _another(field: FieldInfo, stored: Mapping[str, Any], name: str) -> dict[str, Any]:
@@ -218,7 +225,7 @@ def _flag_of(kind: type[Section], place: Sequence[int | str], typed: Mapping[str
     field = kind.model_fields.get(str(place[0])) if place else None
     skipped = 1 if field is not None and len(_blocks(field)) > 1 and len(place) > 2 else None
     path = ".".join(str(part) for index, part in enumerate(place) if index != skipped)
-    option = next((one for one in typed if path == one or path.startswith(f"{one}.")), None)
+    option = max((one for one in typed if path == one or path.startswith(f"{one}.")), key=len, default=None)
     if option is None:
         return path
     return f"{_flag(option, _field(kind, option))} {path.removeprefix(option).removeprefix('.')}".strip()

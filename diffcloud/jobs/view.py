@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from diffcloud.errors import DiffCloudError, EpisodeError
 from diffcloud.identification import found_cloth
@@ -55,17 +57,18 @@ def proposed_scene(episode: Episode, name: str) -> tuple[Scenario | None, list[s
 
     The scene is None if `fit` would refuse the recording. Then the first sentence says why.
     """
-    problems, scenario, size = [], None, (np.inf, np.inf)
+    problems, scenario, table = list[str](), None, None
+    size: tuple[float, float] = (np.inf, np.inf)
     try:
-        cloth = {key: one.value for key, one in found_cloth([episode]).items()}
-        size = cloth["size_m"]
-        layout = find_layout(episode, (size[0], size[1]), cloth["grip_m"])
-        fields = cloth | {key: one.value for key, one in layout.fields.items()}
+        cloth: dict[str, Any] = {key: one.value for key, one in found_cloth([episode]).items()}
+        size = (cloth["size_m"][0], cloth["size_m"][1])
+        layout = find_layout(episode, size, cloth["grip_m"])
+        fields: dict[str, Any] = cloth | {key: one.value for key, one in layout.fields.items()}
+        table = fields["table_height_m"]
         scenario = make_scenario(own_options(fields, name, f"scene of {name}", folder=Path()))
         problems += [f"{text[0].upper()}{text[1:]}." for text in layout.warnings]
     except DiffCloudError as error:
         problems.append(str(error))
-    table = None if scenario is None else float(layout.fields["table_height_m"].value)
     return scenario, [*problems, *_odd_frames(episode), *_odd_points(episode, table, float(np.hypot(*size)))]
 
 
@@ -119,7 +122,7 @@ def _odd_part(parts: list[float], what: str) -> list[str]:
     return [f"{_frames(odd)}{most}: {what}"] if len(odd) else []
 
 
-def _frames(numbers: np.ndarray) -> str:
+def _frames(numbers: NDArray[np.int64]) -> str:
     """Name up to three frames."""
     more = f" and {len(numbers) - 3} more" if len(numbers) > 3 else ""
     return f"Frame{'s' * (len(numbers) > 1)} {', '.join(map(str, numbers[:3]))}{more}"

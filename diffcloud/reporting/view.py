@@ -51,7 +51,7 @@ def proposed_layers(scenario: Scenario) -> list[Layer]:
     return [cloth, *held, *table_layers(scenario, scene.mesh.nodes)]
 
 
-def world_axes(near: NDArray[np.float64]) -> list[Layer]:
+def world_axes(near: NDArray[np.floating]) -> list[Layer]:
     """Return the directions of x, y and z of the world, 10 cm long, beside points [N, 3]."""
     low = near.min(axis=0)
     tips = low + _AXES_M * np.eye(3)
