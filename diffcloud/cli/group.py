@@ -50,7 +50,7 @@ def _imported(name: str, place: str) -> Any:
         alone = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
         alone.command(name)(found)
         found = alone
-    command = get_command(found)
+    command: Any = get_command(found)
     command.name = name
     for param in command.params:
         shown = param.display_type_rich
