@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 from rich.console import Console
+from rich.panel import Panel
 from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
@@ -61,6 +62,14 @@ def finish(result: dict[str, Any], as_json: bool) -> None:
         sys.stdout.flush()
 
 
+def show_panel(title: str, rows: Sequence[tuple[str, str | Table]], *, style: str) -> None:
+    """Print one panel on standard error: a name on the left of each row, its text or table on the right."""
+    grid = Table.grid(padding=(0, 2))
+    for name, content in ((name, content) for name, content in rows if content):
+        grid.add_row(Text(name, "bold"), content)
+    errors.print(Panel(grid, title=Text(title, f"bold {style}"), title_align="left", border_style=style, expand=False))
+
+
 def known(number: float | None, form: str) -> str:
     """Format a number that may be missing for a table cell."""
     return "–" if number is None else format(number, form)
@@ -89,32 +98,35 @@ def say(head: str, message: str, *, style: str, console: Console | None = None) 
 
 
 @contextmanager
-def progress_bar(label: str, total: int | None) -> Iterator[Callable[[float, str], None]]:
+def progress_bar(label: str, total: int | None, budget_s: float | None = None) -> Iterator[Callable[[float, str], None]]:
     """Show a progress bar on standard error. Yields a function to call with (done, text).
 
     Without a terminal, a line is printed every ten seconds.
 
     Args:
-        total: total amount of work. None: unknown, so the remaining time is not shown.
+        total: total amount of work. None: unknown, so the bar shows the elapsed part of `budget_s`.
+        budget_s: time limit of the work [s], shown beside the elapsed time.
     """
+    limit = "" if budget_s is None else f" of {budget_s:.0f} s"
     columns: tuple[ProgressColumn, ...] = (
         TextColumn("{task.description}", style="bold", markup=False),
         BarColumn(bar_width=24),
         *((MofNCompleteColumn(), TimeRemainingColumn()) if total is not None else ()),
         TimeElapsedColumn(),
+        TextColumn(limit.strip(), markup=False),
         TextColumn("{task.fields[text]}", markup=False),
     )
     with Progress(*columns, console=errors, transient=True, disable=not errors.is_terminal) as progress:
-        task = progress.add_task(label, total=total, text="")
+        task = progress.add_task(label, total=budget_s if total is None else total, text="")
         began = told = time.monotonic()
 
         def update(done: float, text: str = "") -> None:
             nonlocal told
-            progress.update(task, completed=done, text=text)
             now = time.monotonic()
+            progress.update(task, completed=done if total is not None else now - began, text=text)
             if progress.disable and now - told >= _QUIET_S:
                 told = now
-                so_far = f"{now - began:.0f} s"
+                so_far = f"{now - began:.0f}{limit or ' s'}"
                 if total is not None:
                     left = f", about {(now - began) * (total - done) / done:.0f} s left" if 0 < done < total else ""
                     so_far = f"{done:.4g} of {total}, {so_far}{left}"

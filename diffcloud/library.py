@@ -41,7 +41,7 @@ from diffcloud.identification import (
 from diffcloud.io.episodes import Episode, read_episode
 from diffcloud.io.files import read_yaml, together, write_json, write_text
 from diffcloud.io.imports import cloud_folder
-from diffcloud.reporting.fit_page import Status, Told, findings_of, page_of
+from diffcloud.reporting.fit_page import Status, Told, page_of, summary_of
 from diffcloud.scene.scenarios import Scenario, load_scenario
 from diffcloud.scene.scenarios.catalogue import make_scenario, own_options
 from diffcloud.scene.scenarios.layout import find_layout
@@ -351,7 +351,7 @@ def _status(record: FitRecord, intervals: Intervals | None) -> str:
 
 
 def report(fit: Fit, recordings: Episode | Sequence[Episode], path: str | Path) -> Path:
-    """Write the HTML report of a fit: findings, intervals, and a player of recorded clouds and fitted cloths.
+    """Write the HTML report of a fit: status, intervals, and a player of recorded clouds and fitted cloths.
 
     Args:
         recordings: the recordings of the fit, in the same order.
@@ -370,7 +370,7 @@ def report(fit: Fit, recordings: Episode | Sequence[Episode], path: str | Path) 
     members = [Recording(scene.scenario, scene.name, _as_fitted(scene, episode)) for scene, episode in pairs]
     status = Status.interrupted if fit.status == "interrupted" else Status.finished
     told = Told(fit.record, compared(fit.record, members), fit.intervals, status)
-    page = page_of(told, findings_of(told), {one.name: one.episode for one in members}, fit.motions)
+    page = page_of(told, summary_of(told), {one.name: one.episode for one in members}, fit.motions)
     write_text(Path(path), page)
     return Path(path)
 

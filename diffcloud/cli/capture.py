@@ -27,15 +27,19 @@ def record(
         Literal["arm", "cameras", "all"] | None,
         typer.Option(help="Record nothing; check what a capture relies on. The arm moves a little, if it is checked."),
     ] = None,
-    dry_run: Annotated[bool, typer.Option(help="Check the plan; open nothing. With --check arm: move nothing.")] = False,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Check the plan; open nothing. With --check arm: move nothing.")
+    ] = False,
     yes: Annotated[bool, typer.Option("--yes", help="Do not ask before the arm moves, nor for a pulled cable.")] = False,
     label: Annotated[
         list[str] | None,
         typer.Option(help="KEY=VALUE, kept in episode.json, such as scenario=lift or fabric=tan; repeated."),
     ] = None,
-    home: Annotated[bool, typer.Option(help="Move to the arm's home position first.")] = False,
-    clear_faults: Annotated[bool, typer.Option(help="Clear the arm's faults first.")] = False,
-    keep_recording: Annotated[bool, typer.Option(help="Also keep the SDK's own .db3 beside the episode.")] = False,
+    home: Annotated[bool, typer.Option("--home", help="Move to the arm's home position first.")] = False,
+    clear_faults: Annotated[bool, typer.Option("--clear-faults", help="Clear the arm's faults first.")] = False,
+    keep_recording: Annotated[
+        bool, typer.Option("--keep-recording", help="Also keep the SDK's own .db3 beside the episode.")
+    ] = False,
     json: JsonFlag = False,
 ) -> None:
     """Drive the arm along a trajectory and record cameras and arm, writing to disk while it runs.

@@ -9,15 +9,17 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from rich.table import Table
 
 from diffcloud.cli.options import ADVANCED, JsonFlag, ParamsFile, SceneName, Threads, Topics, merged, settings_options
-from diffcloud.console import duration_s, errors, finish
+from diffcloud.console import duration_s, finish, show_panel
 from diffcloud.errors import ConfigError
 from diffcloud.estimation.settings import AdamSolver, FitSettings
 
 if TYPE_CHECKING:
     from diffcloud.estimation.task import Recording
     from diffcloud.jobs.cloth_fit import ClothFit
+    from diffcloud.reporting.page import Summary
 
 _FITTING = 0.9
 """Part of the time of --budget after which fits end: the report needs some, too."""
@@ -44,40 +46,37 @@ def fit(
     recordings: Annotated[
         list[Path],
         typer.Argument(
-            help="Recordings of one cloth: folders of numbered clouds with a gripper.csv, raw episodes, ROS bags, episode "
-            "files. SCENE=FILE names the scene of each."
+            help="Folders of clouds with a gripper.csv, episode files, raw episodes or ROS bags. SCENE=FILE states a scene."
         ),
     ],
-    out: Annotated[Path, typer.Option(help="Folder: fit.json, intervals.json, report.html, and what was found.")],
+    out: Annotated[Path, typer.Option(help="Folder for fit.json, intervals.json, report.html and the scene.")],
     settings: Mapping[str, Any],
-    size: Annotated[str | None, typer.Option(help="Sides in metres, such as 0.40x0.30. Default: as seen.")] = None,
+    size: Annotated[str | None, typer.Option(help="Sides in m, such as 0.40x0.30. Default: from the first frame.")] = None,
     density: Annotated[
-        str | None, typer.Option(help="Weighed mass over area, in kg per square metre, such as 0.24 or 0.24+-0.01.")
+        str | None, typer.Option(help="Mass per area in kg/m², such as 0.24 or 0.24+-0.01. Default: estimated.")
     ] = None,
     scene: SceneName = None,
     budget: Annotated[
         str,
-        typer.Option(help="Time for reading, fits and report (90, 60s, 3min, 1h, none). Then the best so far is reported."),
+        typer.Option(help="Time limit, such as 90, 60s, 3min, 1h, or none."),
     ] = "5min",
     topic: Topics = None,
     init: Annotated[
         str,
         typer.Option(
-            help="First start: middle, PARAMETER=VALUE,..., or a regressor's prediction: mlp, ... or its checkpoint.",
+            help="First start: middle, PARAMETER=VALUE,..., mlp or another network, or a checkpoint.",
             rich_help_panel=ADVANCED,
         ),
     ] = "middle",
-    separate: Annotated[
-        bool, typer.Option("--separate", help="Fit each recording alone, in OUT/<recording>, instead of all together.")
-    ] = False,
-    dvc: Annotated[bool, typer.Option("--dvc", help="Make a DVC project of OUT: dvc.yaml and params.yaml.")] = False,
+    separate: Annotated[bool, typer.Option("--separate", help="Fit each recording alone, in OUT/<recording>.")] = False,
+    dvc: Annotated[bool, typer.Option("--dvc", help="Make a DVC project of OUT.")] = False,
     threads: Threads = None,
     params: ParamsFile = None,
     json: JsonFlag = False,
 ) -> None:
-    """Find the parameters of a cloth from recordings of it: layout, joint fit, intervals, and a report.
+    """Estimate the parameters of a cloth from its recordings, with intervals and a report.
 
-    Ctrl-C writes the best so far. The same command keeps what is finished and goes on.
+    Ctrl-C reports the best fit so far. The same command continues.
     """
     began = time.monotonic()
     from diffcloud.io.files import claimed
@@ -109,11 +108,9 @@ def fit(
                 paths = [path for path, _ in group.values()]
                 task = _found(paths, folder, sides, weighed, topic or (), settings, stored, init)
             left = None if seconds is None else max(_FITTING * seconds - (time.monotonic() - began), 1.0)
-            told, findings = task.run(left)
-            for line in findings:
-                errors.print(line, soft_wrap=True)
-            errors.print(f"Wrote {folder / 'report.html'}, {folder / 'fit.json'}.")
-            results[folder.name] = result_of(told, findings)
+            told, summary = task.run(left)
+            _show(summary, folder)
+            results[folder.name] = result_of(told, summary)
             if told.status == Status.interrupted:
                 interrupted = True
                 break
@@ -122,6 +119,23 @@ def fit(
     finish(results if separate else next(iter(results.values())), json)
     if interrupted:
         raise KeyboardInterrupt
+
+
+def _show(summary: Summary, folder: Path) -> None:
+    """Print what a person reads first, as on the first screen of the report."""
+    table = Table(*summary.parameters.heads, box=None, padding=(0, 2, 0, 0))
+    for row in summary.parameters.rows:
+        table.add_row(*(f"{cell.text} ({cell.note})" if cell.note else cell.text for cell in row))
+    steps = "\n".join(f"{index}. {step}" for index, step in enumerate(summary.next_steps, 1))
+    rows: list[tuple[str, str | Table]] = [
+        ("Status", "\n".join([summary.residual, *summary.findings])),
+        ("Parameters", table),
+        ("Held out", summary.held_out),
+        ("Next", steps),
+        ("Files", f"{folder / 'report.html'}, {folder / 'fit.json'}"),
+    ]
+    style = {True: "green", False: "red", None: "yellow"}[summary.good]
+    show_panel(summary.status, rows, style=style)
 
 
 def _members(recordings: Sequence[Path], scene: str | None) -> dict[str, tuple[Path, str | None]]:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import ast
 import importlib
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,9 @@ from typing import Any
 import typer
 from typer.core import TyperCommand, TyperGroup
 from typer.main import get_command
+
+_LONGEST = 20
+"""Characters of a list of choices that the help shows as a type."""
 
 
 def command_group(places: Mapping[str, str]) -> type[TyperGroup]:
@@ -46,9 +50,21 @@ def _imported(name: str, place: str) -> Any:
         alone = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
         alone.command(name)(found)
         found = alone
-    command = get_command(found)
+    command: Any = get_command(found)
     command.name = name
+    for param in command.params:
+        shown = param.display_type_rich
+        vars(param)["display_type_rich"] = lambda ctx, shown=shown: _short_type(shown(ctx))
+        vars(param)["_get_number_range_help_str"] = lambda: ""
     return command
+
+
+def _short_type(text: str | None) -> str:
+    """Shorten the type of a value in the help, so that the explanation has room: `<list[str]>` is TEXT."""
+    kind = re.sub(r"<(?:list\[)?([\w|]+).*>", r"\1", text or "")
+    if "|" in kind and len(kind) > _LONGEST:
+        return "NAME"
+    return {"bool": "", "str": "TEXT", "float": "NUMBER"}.get(kind, kind if "|" in kind else kind.upper())
 
 
 def _summary(name: str, place: str) -> TyperCommand:

@@ -23,17 +23,16 @@ Topics = Annotated[
     list[str] | None,
     typer.Option(
         "--topic",
-        help="ROS: which topic to take where several could be: of clouds, depth, colour, camera_info, the tool's pose, "
-        "joint states or tf; repeated. TOPIC#NUMBER takes one of several publishers of joint states on it.",
+        help="ROS: topic to use, or TOPIC#NUMBER of one of its publishers; repeatable.",
     ),
 ]
-JsonFlag = Annotated[bool, typer.Option("--json", help="End standard output with one JSON object.")]
+JsonFlag = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
 Threads = Annotated[
     int | None,
     typer.Option(
         min=1,
         max=1024,
-        help="Threads that simulate; results are the same for any number. Default: all cores.",
+        help="Threads of the simulation. Default: all cores.",
         rich_help_panel=ADVANCED,
     ),
 ]
@@ -42,7 +41,7 @@ Workers = Annotated[
     typer.Option(
         min=1,
         max=1024,
-        help="Processes, each with one thread; results are the same for any number. Default: one per core.",
+        help="Processes, each with one thread. Default: one per core.",
         rich_help_panel=ADVANCED,
     ),
 ]
@@ -50,20 +49,18 @@ Scheduler = Annotated[
     str | None,
     typer.Option(
         "--scheduler",
-        help="Address of a Dask scheduler, e.g. tcp://host:8786, whose workers see the same folders; instead of --workers.",
+        help="Address of a Dask scheduler, such as tcp://host:8786, instead of --workers. It needs the same folders.",
         rich_help_panel=ADVANCED,
     ),
 ]
 ParamsFile = Annotated[
     Path | None,
-    typer.Option(
-        "--params", help="YAML with a section for this command; options given here win.", rich_help_panel=ADVANCED
-    ),
+    typer.Option("--params", help="YAML file of settings. Options override it.", rich_help_panel=ADVANCED),
 ]
 StageParams = Annotated[Path | None, typer.Option("--params", help="YAML with a section for each stage.")]
 SCENE_HELP = (
-    "lift, fold, band_stretch, vest_hang, shake, recorded_lift, recorded_fold, a YAML file, the name of one in raw/scenes, "
-    "an ARCSim scene JSON, or release_lift=FILE.json (release_fold, release_hang, release_band) for a published one."
+    "YAML or ARCSim JSON file, or lift, fold, band_stretch, vest_hang, shake, recorded_lift, recorded_fold, or "
+    "release_lift=FILE.json (release_fold, release_hang, release_band)."
 )
 SceneName = Annotated[str | None, typer.Option("--scene", help=SCENE_HELP)]
 
@@ -129,11 +126,18 @@ def merged(settings: Section, typed: Mapping[str, Any]) -> Any:
     try:
         return kind.model_validate(told)
     except ValidationError as error:
-        faults = [
-            f"{_flag_of(kind, fault['loc'], typed)}: {fault['msg'].removeprefix('Value error, ')}"
-            for fault in error.errors()
-        ]
+        faults = [_said(_flag_of(kind, fault["loc"], typed), fault) for fault in error.errors()]
         raise ConfigError("; ".join(faults) + ".") from error
+
+
+def _said(flag: str, fault: Any) -> str:
+    """Return an option, what is allowed, and what was found, of one fault of a validator."""
+    if fault["type"] == "extra_forbidden":
+        return f"{flag} does not apply to the chosen solver. Omit it, or choose another --solver"
+    text = fault["msg"].removeprefix("Value error, ").replace("Input should be", "must be")
+    found = fault["input"]
+    got = f" (got {found!r})" if isinstance(found, str | int | float) and "got " not in text else ""
+    return f"{flag}: {text}{got}" if flag else text.replace("bounds.", "--bound ") + got
 
 
 def _another(field: FieldInfo, stored: Mapping[str, Any], name: str) -> dict[str, Any]:
@@ -221,7 +225,7 @@ def _flag_of(kind: type[Section], place: Sequence[int | str], typed: Mapping[str
     field = kind.model_fields.get(str(place[0])) if place else None
     skipped = 1 if field is not None and len(_blocks(field)) > 1 and len(place) > 2 else None
     path = ".".join(str(part) for index, part in enumerate(place) if index != skipped)
-    option = next((one for one in typed if path == one or path.startswith(f"{one}.")), None)
+    option = max((one for one in typed if path == one or path.startswith(f"{one}.")), key=len, default=None)
     if option is None:
         return path
     return f"{_flag(option, _field(kind, option))} {path.removeprefix(option).removeprefix('.')}".strip()

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import time
 import webbrowser
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -21,6 +21,7 @@ from diffcloud.console import (
     progress_bar,
     refuse_many,
     told_progress,
+    warn,
     writes,
 )
 from diffcloud.errors import ConfigError
@@ -44,35 +45,28 @@ _PHOTOGRAPH_PX = 900
 def view(
     episodes: Annotated[
         list[Path],
-        typer.Argument(
-            help="Episode files (.npz), folders of them, or raw episodes; --live takes one that is recorded now."
-        ),
+        typer.Argument(help="Folders of numbered clouds, episode files (.npz), folders of them, or raw episodes."),
     ],
     out: Annotated[Path, typer.Option(help="HTML file.")] = Path("view.html"),
     scene: SceneName = None,
-    fit: Annotated[Path | None, typer.Option(help="JSON of a fit to these episodes: its motion and pose.")] = None,
-    frames: Annotated[int, typer.Option(min=1, max=1000, help="Of an episode that are shown, evenly spread.")] = 60,
-    points: Annotated[int, typer.Option(min=1, max=100_000, help="Of a cloud that are shown.")] = 2000,
-    live: Annotated[
-        bool, typer.Option("--live", help="Follow a raw episode in a browser while it is recorded. Ctrl-C stops watching.")
-    ] = False,
-    calibration: Annotated[
-        Path | None, typer.Option(help="Of --live: calibration file. Default: what camera.json says.")
-    ] = None,
+    fit: Annotated[Path | None, typer.Option(help="fit.json of a fit to these recordings.")] = None,
+    frames: Annotated[int, typer.Option(min=1, max=1000, help="Frames shown of a recording, evenly spread.")] = 60,
+    points: Annotated[int, typer.Option(min=1, max=100_000, help="Points shown of a cloud.")] = 2000,
+    live: Annotated[bool, typer.Option("--live", help="Follow a raw episode while it is recorded. Ctrl-C stops.")] = False,
+    calibration: Annotated[Path | None, typer.Option(help="With --live: calibration file. Default: camera.json.")] = None,
     port: Annotated[
-        int, typer.Option(min=1024, max=65535, help="Of --live; if it is taken, the next free one is used.")
+        int, typer.Option(min=1024, max=65535, help="With --live: port. If it is in use, the next free one.")
     ] = 8080,
     open_: Annotated[bool, typer.Option("--open", help="Open the page in a browser.")] = False,
     params: ParamsFile = None,
     json: JsonFlag = False,
 ) -> None:
-    """Look at episodes: clouds, cloth, gripper, table and cameras over time, on one page that needs no network.
+    """Show recordings on one page: clouds, gripper, cloth, table and cameras over time, and what looks wrong.
 
-    A scenario, given or named by the episode, adds its cloth under the recorded gripper.
-    A fit adds the fitted cloth, before and after its pose was found.
-    Raw episodes are made into clouds, and their images show what was masked.
+    Without --scene and --fit, the cloth is the one that `diffcloud fit` would start from.
+    --scene simulates its cloth under the recorded gripper. --fit shows the fitted cloth, with and without its pose.
+    Raw episodes are converted to clouds, and their images show what was masked.
     """
-    from diffcloud.estimation.record import read_fit
     from diffcloud.reporting.view import build_view
 
     if live:
@@ -80,24 +74,32 @@ def view(
             raise ConfigError(f"--live follows one raw episode, got {len(episodes)} paths.")
         _follow(episodes[0], calibration, points, port, open_=open_)
         return
-    record = None if fit is None else read_fit(fit)
-    overlays, facts = [], []
-    paths = [path for given in episodes for path in ([given] if _is_raw(given) else episode_files([given]))]
+    record = None
+    if fit is not None:
+        from diffcloud.estimation.record import read_fit
+
+        record = read_fit(fit)
+    overlays, facts, problems = [], [], list[tuple[str, str]]()
+    paths = [path for given in episodes for path in ([given] if _is_folder(given) else episode_files([given]))]
     refuse_many(paths, _MOST_EPISODES, "A page shows", "Give fewer episodes, or make several pages")
     for path in told_progress("drawing", [path.absolute() for path in paths]):  # "." has no name
-        seen = _raw(path, params) if _is_raw(path) else _Shown(read_episode(path), {})
+        seen = _seen(path, params)
         chosen = _spread(seen.episode.frame_count, frames)
-        layers, told = _layers(path, seen.episode, chosen, points, scene, fit, record)
+        layers, told, odd = _layers(path, seen.episode, chosen, points, scene, fit, record)
         overlays.append(_overlay(path.stem, seen, chosen, layers))
         facts += [(path.stem, line) for line in (_about(seen.episode), *told)]
+        problems += [(path.stem, line) for line in (*seen.missing, *odd)]
     note = "Masked pixels are red, what was kept as cloth is green." if any(one.photographs for one in overlays) else ""
     title = paths[0].absolute().stem if len(paths) == 1 else f"{len(paths)} episodes"
-    page = build_view(overlays, title=title, note=note, facts=facts)
+    page = build_view(overlays, title=title, note=note, facts=facts, problems=problems)
     write_text(out, page)
+    for name, text in problems:
+        warn(f"{name}: {text}")
     errors.print(f"Wrote {out} ({len(page) / 1e6:.1f} MB).", soft_wrap=True)
     if open_:
         webbrowser.open(out.resolve().as_uri())
-    finish({"out": str(out), "episodes": len(overlays), "bytes": len(page.encode())}, json)
+    result = {"out": str(out), "episodes": len(overlays), "bytes": len(page.encode())}
+    finish({**result, "problems": [f"{name}: {text}" for name, text in problems]}, json)
 
 
 def _follow(folder: Path, calibration: Path | None, points: int, port: int, *, open_: bool) -> None:
@@ -124,10 +126,13 @@ def _follow(folder: Path, calibration: Path | None, points: int, port: int, *, o
 
 @dataclass(frozen=True)
 class _Shown:
-    """An episode, and of a raw one a JPEG for each frame."""
+    """A recording to show."""
 
     episode: Episode
-    photographs: Mapping[int, bytes]
+    photographs: Mapping[int, bytes] = field(default_factory=dict)
+    """Of a raw episode, a JPEG for each frame."""
+    missing: Sequence[str] = ()
+    """Sentences on what the recording lacks."""
 
 
 def _layers(
@@ -138,11 +143,12 @@ def _layers(
     scene: str | None,
     fit: Path | None,
     record: FitRecord | None,
-) -> tuple[list[Layer], list[str]]:
-    """What is drawn of one episode, and what the table says of it."""
+) -> tuple[list[Layer], list[str], list[str]]:
+    """Return what is drawn of one episode, lines of the table, and what looks wrong."""
     from diffcloud.jobs.scenarios import choose_scenario, fitted_scenario, scene_named
+    from diffcloud.jobs.view import proposed_scene
     from diffcloud.reporting.overlay import fitted_layers, recorded_layers
-    from diffcloud.reporting.view import scene_layers, table_layers, unposed_layer
+    from diffcloud.reporting.view import proposed_layers, scene_layers, table_layers, unposed_layer, world_axes
     from diffcloud.scene.scenarios import SCENARIO_NAMES
 
     times = episode.times[frames]
@@ -151,6 +157,7 @@ def _layers(
         scene = str(meant)
     alone = fit is None and scene is None
     layers = recorded_layers(episode, frames, points=points, rng=np.random.default_rng(0), gripper=alone)
+    layers += world_axes(episode.points)
     if fit is not None and record is not None:
         from diffcloud.estimation.result import read_motion
 
@@ -160,11 +167,15 @@ def _layers(
         layers += fitted_layers(motion, times)
         layers += [unposed_layer(found, recording, motion, times), *table_layers(found, motion.nodes.reshape(-1, 3))]
         values = ", ".join(f"{key} {one.value:.3g} {one.unit}" for key, one in record.parameters.items())
-        return layers, [f"fitted in {recording.scenario}: {values}; RMS {recording.rms_mm:.1f} mm"]
+        return layers, [f"fitted in {recording.scenario}: {values}; RMS {recording.rms_mm:.1f} mm"], []
     if scene is None:
-        return layers, ["no scenario: the recording alone"]
+        proposed, odd = proposed_scene(episode, path.stem)
+        if proposed is None:
+            return layers, ["no scene: the recording alone"], odd
+        about = ", ".join(f"{side:.3f}" for side in np.ptp(proposed.scene.mesh.verts, axis=0))
+        return layers + proposed_layers(proposed), [f"proposed cloth: sides {about} m"], odd
     chosen = scene_named(scene)
-    return layers + scene_layers(chosen, episode, times), [f"scenario {chosen.name}, nominal material"]
+    return layers + scene_layers(chosen, episode, times), [f"scene {chosen.name}, nominal material"], []
 
 
 def _overlay(name: str, seen: _Shown, frames: list[int], layers: list[Layer]) -> Overlay:
@@ -182,6 +193,25 @@ def _about(episode: Episode) -> str:
         f"{episode.frame_count} frames over {episode.times[-1] - episode.times[0]:.2f} s, {sizes.min()} to {sizes.max()} "
         f"points a frame, {grippers}, cameras: {cameras}"
     )
+
+
+def _is_folder(path: Path) -> bool:
+    """Whether a folder is one recording: a raw episode or numbered clouds."""
+    from diffcloud.jobs.view import is_cloud_folder
+
+    return _is_raw(path) or is_cloud_folder(path)
+
+
+def _seen(path: Path, params: Path | None) -> _Shown:
+    """Read a recording of any kind."""
+    from diffcloud.jobs.view import cloud_recording
+
+    if _is_raw(path):
+        return _raw(path, params)
+    if not path.is_dir():
+        return _Shown(read_episode(path))
+    episode, missing = cloud_recording(path)
+    return _Shown(episode, missing=missing)
 
 
 def _is_raw(path: Path) -> bool:

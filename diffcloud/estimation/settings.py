@@ -77,13 +77,13 @@ class FitSettings(Section):
     """Settings of a fit."""
 
     parameters: Names = ["stretching", "density"]
-    """Parameters to find, comma-separated, such as stretching,bending,density."""
+    """Parameters to estimate, such as stretching,bending,density."""
     bounds: dict[str, Bounds] = Field(default={}, json_schema_extra={"flag": "--bound"})
-    """Range of a parameter, NAME=LOW:HIGH, repeatable. Default: the scene's."""
+    """Range of a parameter, NAME=LOW:HIGH; repeatable."""
     fixed: dict[str, Component] = Field(default={}, json_schema_extra={"flag": "--fix"})
-    """A parameter that is known, NAME=VALUE, repeatable."""
+    """Known value of a parameter; repeatable."""
     solver: Solver = LikelihoodSolver()
-    """likelihood, with intervals; adam, the paper's; cma_es or random_search, without derivatives."""
+    """likelihood (with intervals), adam (the paper's), cma_es or random_search."""
     points: Count | None = None
     """Number of points sampled on the cloth in each frame. Default: the scene's."""
     frames: Annotated[list[Annotated[int, Field(ge=-100_000, le=100_000)]], Field(min_length=1)] | None = None
@@ -91,18 +91,15 @@ class FitSettings(Section):
     seed: Seed = 0
     """Seed of all random numbers."""
     loss: Literal["surface", "paper"] = "surface"
-    """surface: both directions, all frames. paper: from cloth to recording only, squared, at the scene's loss frames."""
+    """surface: both directions, all frames. paper: one-sided, as in the paper."""
     alignment: Name | None = None
-    """Pose variables to estimate, each with its prior standard deviation: x=2cm,yaw=5deg,lag=50ms. Of x, y, z, tilt_x,
-    tilt_y, yaw, lag, scale; or none. Default: all but scale."""
+    """Pose variables and their standard deviations, such as x=2cm,yaw=5deg,lag=50ms; or none. Default: all but scale."""
     initial_state: Name | None = None
-    """Deviations from the initial state to estimate, each with its prior standard deviation: turn=5deg, shape=5mm,
-    size=2%, track=2%; or none. Default: what the scene says, for likelihood with a smooth integrator."""
+    """Its standard deviations: turn=5deg,shape=5mm,size=2%,track=2%; or none."""
     prior: Name | None = None
-    """Prior standard deviation of each multiplier as a factor, such as bending=3x; or none. Default: 10x."""
+    """Standard deviations of parameters, such as bending=3x; or none. Default: 10x."""
     uncertain: Name | None = None
-    """Nuisance material to estimate too, each with its prior standard deviation as a factor:
-    bending=1.5x,air_density=1.3x; or none. Default: the scene's, for likelihood with a smooth integrator."""
+    """Nuisance material and its standard deviations, such as bending=1.5x; or none."""
     joint: bool = False
     """Fit one parameter set to all recordings, of one cloth."""
     level: Level = LEVEL

@@ -23,7 +23,8 @@ from diffcloud.jobs import ctrl_c
 from diffcloud.jobs.fits import FitJob
 from diffcloud.jobs.pool import check_interrupt
 from diffcloud.jobs.scene_files import read_fields
-from diffcloud.reporting.fit_page import Status, Told, findings_of, page_of
+from diffcloud.reporting.fit_page import Status, Told, page_of, summary_of
+from diffcloud.reporting.page import Summary
 from diffcloud.scene.scenarios import load_scenario
 from diffcloud.sim import warm
 
@@ -44,14 +45,14 @@ class ClothFit:
     def job(self) -> FitJob:
         return FitJob("fit", self.members, self.settings, self.out / "stages", self.init)
 
-    def run(self, seconds: float | None) -> tuple[Told, list[str]]:
+    def run(self, seconds: float | None) -> tuple[Told, Summary]:
         """Fit and write the results. After Ctrl-C or the time limit, the best fit so far is written.
 
         Args:
             seconds: time limit of the fit. None: no limit.
 
         Returns:
-            The results, and the findings about them in sentences.
+            The results, and the summary that a person reads first.
 
         Raises:
             DiffCloudError: the time limit was reached before the first loss evaluation.
@@ -66,7 +67,7 @@ class ClothFit:
         record: FitRecord | None = None
         intervals: Intervals | None = None
         try:
-            with ctrl_c.none_lost(), ctrl_c.pressed_after(seconds) as is_over, progress_bar("fit", None) as update:
+            with ctrl_c.none_lost(), ctrl_c.pressed_after(seconds) as is_over, progress_bar("fit", None, seconds) as update:
                 record = job.run(update)
                 check_interrupt()
                 intervals = self._intervals(record)
@@ -85,9 +86,9 @@ class ClothFit:
         if intervals is None:  # compute them for the interrupted fit too
             intervals = self._intervals(record)
         told = Told(record, compared(record, self._with_grip_found(record)), intervals, status)
-        findings = findings_of(told)
-        self._write(told, findings)
-        return told, findings
+        summary = summary_of(told)
+        self._write(told, summary)
+        return told, summary
 
     def _scene(self, name: str) -> Path:
         """Path of a scenario file while the fit is unfinished."""
@@ -114,10 +115,10 @@ class ClothFit:
             for one in self.members
         ]
 
-    def _write(self, told: Told, findings: Sequence[str]) -> None:
+    def _write(self, told: Told, summary: Summary) -> None:
         out, files = self.out, self.job.files
         motions = [read_motion(files[1], index) for index in range(len(self.members))]
-        page = page_of(told, findings, {one.name: one.episode for one in self.members}, motions)
+        page = page_of(told, summary, {one.name: one.episode for one in self.members}, motions)
         with together():
             for path in files:
                 _copy(path, out / f"fit{path.suffix}")

@@ -23,6 +23,7 @@ from diffcloud.jobs.ctrl_c import none_lost
 from diffcloud.jobs.pool import Tell, check_interrupt, run_all
 from diffcloud.jobs.scenarios import choose_scenario
 from diffcloud.scene.scenarios import Scenario
+from diffcloud.sim.properties import PARAMETERS
 
 JOINT = "joint"
 """Name of the joint fit of all recordings."""
@@ -98,9 +99,11 @@ class FitJob:
             """Report the current step. The fraction done stays 0, because the number of starts is not known in advance."""
             check_interrupt()
             shown = {name: progress.values[name] for name in self.settings.parameters if name in progress.values}
-            values = "  ".join(f"{name} {value:.3g}" for name, value in scenario.in_si(shown).items())
+            values = "  ".join(
+                f"{name} {value:.3g} {PARAMETERS[name].unit}" for name, value in scenario.in_si(shown).items()
+            )
             step = progress.iteration if progress.simulations is None else progress.simulations
-            tell(0.0, f"{doing}step {step}  best {unit_mm * progress.best**0.5:.2f} mm  {values}")
+            tell(0.0, f"{doing}step {step}  residual {unit_mm * progress.best**0.5:.2f} mm  {values}")
 
         def show_left_out(done: float, doing: str, progress: Progress) -> None:
             show(f"{doing}  ", progress)

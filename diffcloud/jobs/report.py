@@ -8,26 +8,21 @@ from typing import Any
 import numpy as np
 
 import diffcloud
-from diffcloud.arcsim.release import RELEASE
 from diffcloud.errors import ConfigError
 from diffcloud.estimation.record import read_fit
 from diffcloud.estimation.result import read_motion
+from diffcloud.evaluation.intervals import Intervals
 from diffcloud.evaluation.record import ComparisonFile, FitRow, PredictionRow, check_file
 from diffcloud.evaluation.summary import tables as comparison_tables
 from diffcloud.io.episodes import read_episode
 from diffcloud.io.files import read_json, together, write_bytes, write_text
 from diffcloud.io.tables import read_csv
 from diffcloud.jobs.fits import fit_file
-from diffcloud.jobs.scenarios import choose_scenario, fitted_scenario
 from diffcloud.jobs.settings import Config
-from diffcloud.reporting import (
-    ComparisonEntry,
-    EpisodeEntry,
-    TrainingEntry,
-    build_page,
-    comparison_figures,
-    overlay_figure,
-)
+from diffcloud.reporting.comparison import ComparisonEntry
+from diffcloud.reporting.figures import comparison_figures, overlay_figure
+from diffcloud.reporting.page import EpisodeEntry, build_page
+from diffcloud.reporting.regressors import TrainingEntry
 
 
 def write_report(
@@ -52,15 +47,18 @@ def write_report(
     if not table.is_file():
         raise ConfigError(f"No such table: {table}; run `python -m pipeline.evaluate` first.")
     entries: list[EpisodeEntry] = []
-    loss_frames: dict[str, tuple[int, ...]] = {}
+    compared = _compared(tables)
+    intervals = {
+        (record["scenario"], record["fit"]): Intervals.model_validate(record["intervals"])
+        for record in compared["records"]
+        if record["intervals"] is not None
+    }
     rows = table_rows(table)
     check_file(list[FitRow], table, rows)
     for known in rows:
         scenario, name = str(known["scenario"]), str(known["episode"])
         path = fit_file(fits, scenario, name)
         fit = read_fit(path)
-        if scenario not in loss_frames:
-            loss_frames[scenario] = _loss_frames(path, scenario)
         known = {"rms_start_mm": float("nan"), "rms_other_frames_mm": float("nan"), **known}
         index = next((i for i, one in enumerate(fit.episodes) if one.scenario == scenario), 0)
         source = fit.episodes[index].name
@@ -74,7 +72,7 @@ def write_report(
                 episode=read_episode(episodes / scenario / f"{source}.npz"),
                 motion=read_motion(path.with_suffix(".npz"), index),
                 pictures=_pictures(episodes / scenario, source),
-                loss_frames=loss_frames[scenario],
+                intervals=intervals.get((scenario, name)),
             )
         )
     trainings = [
@@ -87,7 +85,7 @@ def write_report(
         "seed of the comparison": str(config.evaluate.seed),
         "diffcloud": diffcloud.__version__,  # versions and times of a single run are beside each fit (`io.timings`)
     }
-    comparison = _comparison(tables, entries)
+    comparison = _comparison(compared, entries)
     predictions = table_rows(tables / "predictions.csv")
     check_file(list[PredictionRow], tables / "predictions.csv", predictions)
     page = build_page(
@@ -107,21 +105,19 @@ def write_report(
     return len(entries), len(page.encode())
 
 
-def _loss_frames(fit: Path, scenario: str) -> tuple[int, ...]:
-    """Loss frames of a fit's scenario. Those of published scenarios are known without the scene file."""
-    if scenario in RELEASE:
-        return (RELEASE[scenario].loss_frame,)
-    return choose_scenario(fitted_scenario(fit, scenario)).loss_frames
-
-
-def _comparison(folder: Path, entries: list[EpisodeEntry]) -> ComparisonEntry:
-    """Read the results of the stage `evaluate` and draw their figures.
+def _compared(folder: Path) -> dict[str, Any]:
+    """Read what the stage `evaluate` has written.
 
     Raises:
         ConfigError: the results are missing or invalid.
     """
-    whole = read_json(folder / "comparison.json", error=ConfigError)
+    whole: dict[str, Any] = read_json(folder / "comparison.json", error=ConfigError)
     check_file(ComparisonFile, folder / "comparison.json", whole)
+    return whole
+
+
+def _comparison(whole: dict[str, Any], entries: list[EpisodeEntry]) -> ComparisonEntry:
+    """What the stage `evaluate` has written, with figures."""
     records, failures = whole["records"], whole["failures"]
     references = {(scenario, name): float(loss) for scenario, name, loss in whole["references"]}
     told = comparison_tables(records, {}, references)

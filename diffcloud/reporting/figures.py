@@ -210,7 +210,7 @@ def overlay_figure(entries: Sequence[EpisodeEntry]) -> Figure | None:
         "overlays",
         "Target, start and fitted cloth",
         "Recorded points (green) with the mesh at the start of the fit (left) and after it (right), from the side, at the "
-        "loss frame of the first episode of each scenario, or at the last frame that its fit compared [length unit].",
+        "frame with the largest residual of the first episode of each scenario [length unit].",
         "data/fits and data/episodes",
     )
 

@@ -1,4 +1,4 @@
-"""What a person reads of a fit: its findings in sentences, its result as JSON, and its page."""
+"""What a person reads of a fit: its summary, its result as JSON, and its page."""
 
 from __future__ import annotations
 
@@ -16,15 +16,24 @@ from diffcloud.estimation.joint import AnyObjective, JointObjective
 from diffcloud.estimation.objective import Objective
 from diffcloud.estimation.record import FitRecord
 from diffcloud.estimation.result import FittedMotion
-from diffcloud.evaluation.intervals import FOLLOWS, Intervals, significant, stated_parameters, worded
+from diffcloud.evaluation.intervals import FOLLOWS, Intervals, stated_parameters
 from diffcloud.evaluation.methods import space_of
 from diffcloud.evaluation.summary import largest_sources
 from diffcloud.io.episodes import Episode
-from diffcloud.reporting.page import EpisodeEntry, build_page
+from diffcloud.reporting.page import EpisodeEntry, Summary, build_page
+from diffcloud.reporting.uncertainty import NamedFit, parameters_table
 from diffcloud.sim.properties import one_set
 
 _TRANSFERS, _GAIN = 1.25, 0.5
 _NO_TIME = "the time was over before they were computed"
+_MOTION = "compare motions with diffcloud simulate --sensitivity, and record one that this parameter moves more"
+_ADVICE = {
+    "density": "weigh the cloth and pass --density",
+    "pose": "calibrate the cameras with diffcloud data calibrate",
+    "grasp": "measure the grasp and state it in the scene as grip_m",
+}
+"""Largest source of a parameter's variance -> what reduces it. Other nuisance material can be measured. For other sources,
+another motion helps."""
 
 
 class Status(StrEnum):
@@ -46,33 +55,38 @@ class Told:
     status: Status
 
 
-def _validation(record: FitRecord, objective: AnyObjective) -> str:
-    """Whether parameters that were fitted without a recording predict it."""
+def _held_out(record: FitRecord, objective: AnyObjective) -> str:
+    """Say whether parameters that were fitted without a recording predict it."""
+    untested = "Not tested: whether the parameters predict another recording."
     if not isinstance(objective, JointObjective):
-        return "Not tested: whether the parameters predict another recording. Fit two recordings to see."
+        return f"{untested} Fit two recordings to see."
     if record.estimate is None:
-        return "Not tested: whether the parameters predict another recording. The solver likelihood tests it."
+        return f"{untested} The solver likelihood tests it."
     held, gains = [], []
     weighed = space_of(record).fixed
     for member, episode in zip(objective.members, record.episodes, strict=True):
-        if episode.left_out is None and record.stop_reason == "interrupted":
-            return "Not tested: whether the parameters predict another recording. The fit ended before."
         if episode.left_out is None:
-            return "Not tested: whether the parameters predict another recording. Leaving a recording out failed."
+            interrupted = record.stop_reason == "interrupted"
+            return f"{untested} {'The fit ended before.' if interrupted else 'Leaving a recording out failed.'}"
         with torch.no_grad():
             run = member.simulate_to_loss(one_set({**weighed, **record.initial_state_in(episode)}))
             middle = float(member.frame_losses(run).mean())  # as the others, without the prior of the pose
-        held.append(episode.left_out.rms_mm / episode.rms_mm)
+        held.append((episode.left_out.rms_mm / episode.rms_mm, episode))
         gains.append((middle - episode.left_out.loss) / max(middle - episode.loss, 1e-300))
-    told = f"left out of the fit, a recording has at most {max(held):.2f} times its residual in the joint fit"
+    ratio, worst = max(held, key=lambda pair: pair[0])
     motions = len({_motion_of(member) for member in objective.members})
-    if max(held) <= _TRANSFERS and min(gains) >= _GAIN:
-        return f"The parameters predict other recordings{'' if motions > 1 else ' of this motion'}: {told}."
-    return f"The parameters do not predict other recordings: {told}."
+    predicted = ratio <= _TRANSFERS and min(gains) >= _GAIN
+    same = " of this motion" if predicted and motions == 1 else ""
+    assert worst.left_out is not None
+    verb = "predict" if predicted else "do not predict"
+    return (
+        f"The parameters {verb} other recordings{same}: without {worst.name}, the fit predicts that recording to "
+        f"{worst.left_out.rms_mm:.1f} mm. With all recordings, it reaches {worst.rms_mm:.1f} mm."
+    )
 
 
 def _motion_of(objective: Objective) -> str:
-    """What a motion is told by: its last displacement, in whole parts of the largest component."""
+    """Describe a motion by its last displacement, in whole parts of the largest component."""
     track = objective.track
     if track is None:
         return "scene"
@@ -80,68 +94,98 @@ def _motion_of(objective: Objective) -> str:
     return str(np.round(end / max(float(np.abs(end).max()), 1e-9), 0).tolist())
 
 
-def follows(record: FitRecord) -> list[str]:
-    """Return one sentence for each recording: until when the simulation follows it."""
-    lines = []
+def _follows(record: FitRecord) -> list[str]:
+    """Return sentences that state until when the simulation follows each recording."""
+    lines, followed, horizons = [], [], []
     for one, told in zip(record.episodes, record.estimate.recordings if record.estimate else (), strict=False):
         gone = np.flatnonzero(np.array(told.chi_squares) > FOLLOWS)
         rate = told.horizon_s / max(one.frames[-1], 1)
         if len(gone) == 0:
-            told_so = f"follows {one.name} to within noise and mesh error up to the horizon, {told.horizon_s:.1f} s"
+            followed.append(one.name)
+            horizons.append(told.horizon_s)
         elif gone[0] == 0:
-            told_so = f"does not follow {one.name} from the first frame on"
+            lines.append(f"The simulation does not follow {one.name} from the first frame on.")
         else:
-            told_so = f"follows {one.name} to within noise and mesh error until {rate * one.frames[gone[0]]:.1f} s only"
-        lines.append(f"The simulation {told_so}.")
+            until = f"until {rate * one.frames[gone[0]]:.1f} s only"
+            lines.append(f"The simulation follows {one.name} to within noise and mesh error {until}.")
+    if followed:
+        names = " and ".join(followed) if len(followed) < 3 else f"{len(followed)} recordings"
+        ends = sorted({f"{horizon:.1f}" for horizon in (min(horizons), max(horizons))})
+        until = f"up to the horizon, {' to '.join(ends)} s"
+        lines.insert(0, f"The simulation follows {names} to within noise and mesh error {until}.")
     return lines
 
 
-def findings_of(told: Told) -> list[str]:
-    """Return the report's first lines: fit to the recordings, prediction of others, parameters."""
-    record, found, lines = told.record, told.intervals, list[str]()
-    if told.status != Status.finished:
-        why, again = (
-            ("Ctrl-C was pressed", "")
-            if told.status == Status.interrupted
-            else ("the time of --budget was over", " with --budget none")
-        )
-        lines.append(f"Unfinished: {why}. These are the best parameters so far. Run the same command{again} to finish.")
+def summary_of(told: Told) -> Summary:
+    """Return status, parameters, findings and next steps of a fit."""
+    record, found = told.record, told.intervals
+    good: bool | None = True
+    status, findings = "Fits to the noise", list[str]()
     if found is None:
         known = record.estimate is not None or told.status != Status.finished
         why = _NO_TIME if known else f"the solver {record.solver} gives none"
-        lines.append(f"The residual is {record.rms_mm:.1f} mm RMS. There are no intervals: {why}.")
+        status, good = "No intervals", None
+        findings.append(f"There are no intervals: {why}.")
     elif not found.fits_to_noise:
-        lines.append(f"The simulation does not fit the recordings to within the noise: {found.reason}.")
-    lines += follows(record)
-    lines.append(_validation(record, told.objective))
-    if found is not None and found.fits_to_noise:
-        lines += found.sentences
-    for name, entry in _parameters(told).items():
-        digits = significant(entry["low"], entry["high"])
-        ends, status, improve = "", "unfinished", ""
-        if found is not None:
-            interval, status = found.parameters[name], entry["status"]
-            first = largest_sources(found.sources, name, 2)
-            ends = f", {found.level:.0%} interval {digits(interval.low)} to {digits(interval.high)}"
-            improve = f" (improve first: {first})" if first else ""
-        lines.append(f"{name}: {digits(entry['value'])} {entry['unit']}{ends}: {worded(status)}{improve}.")
+        status, good = "Model error", False
+        findings.append(f"The simulation does not fit the recordings to within the noise: {found.reason}.")
+    else:
+        if found.warning:
+            status, good = "Fits to the noise, but not converged", None
+        findings += found.sentences
+    if told.status != Status.finished:
+        status, good = f"Unfinished: {told.status.value}", False
+        why = "Ctrl-C was pressed" if told.status == Status.interrupted else "the time of --budget was over"
+        findings.insert(0, f"Unfinished: {why}. These are the best parameters so far.")
+    findings += _follows(record)
     if record.estimate is not None and record.estimate.grip_m is not None:
-        lines.append(f"The grasp is {1e3 * record.estimate.grip_m:.0f} mm wide, as the fit found it.")
-    return lines
+        findings.append(f"The grasp is {1e3 * record.estimate.grip_m:.0f} mm wide, as the fit found it.")
+    return Summary(
+        status=status,
+        good=good,
+        residual=f"residual {record.rms_mm:.1f} mm RMS",
+        parameters=parameters_table([NamedFit("fit", record, found)]),
+        findings=findings,
+        held_out=_held_out(record, told.objective),
+        next_steps=_next_steps(told),
+    )
 
 
-def _parameters(told: Told) -> dict[str, dict[str, Any]]:
-    return stated_parameters(told.record, told.intervals, told.objective.members[0].scenario)
+def _next_steps(told: Told) -> list[str]:
+    """Return at most three things to do, the most useful first."""
+    found, steps = told.intervals, list[str]()
+    if told.status != Status.finished:
+        budget = " with --budget none" if told.status == Status.budget_reached else ""
+        steps.append(f"Run the same command again{budget}: it continues this fit.")
+    usable = found is not None and found.fits_to_noise
+    if found is not None and not usable:
+        steps.append(
+            "Look at the recordings and the fit with diffcloud view: does the cloth start where the clouds show it?"
+        )
+    if found is not None and usable:
+        statuses = {name: one.status for name, one in found.parameters.items() if one.status != "identified"}
+        if "density" in statuses:
+            steps.append("Weigh the cloth, divide by its area and pass --density. Stretching is then known apart from it.")
+        for name in statuses if "density" not in statuses else ():
+            first = max(found.sources, key=lambda source: found.sources[source][name])
+            known = f"measure {first} and pass --fix" if first in told.record.parameters else _MOTION
+            shares = largest_sources(found.sources, name, 2)
+            steps.append(f"{name.capitalize()}: {_ADVICE.get(first, known)} (its variance: {shares}).")
+    if len(told.record.episodes) == 1 and len(steps) < 2:
+        steps.append("Fit a second recording jointly: it tests the prediction and narrows the intervals.")
+    if usable:
+        steps.append("Export the cloth: diffcloud export fit.json --to mujoco --out in_mujoco --check")
+    return steps[:3]
 
 
-def result_of(told: Told, findings: Sequence[str]) -> dict[str, Any]:
-    """For programs."""
+def result_of(told: Told, summary: Summary) -> dict[str, Any]:
+    """Return the result for programs."""
     record, found = told.record, told.intervals
     return {
         "status": told.status.value,
         "solver": record.solver,
         "stop_reason": record.stop_reason,
-        "parameters": _parameters(told),
+        "parameters": stated_parameters(record, found, told.objective.members[0].scenario),
         "rms_mm": record.rms_mm,
         "fits_to_noise": None if found is None else found.fits_to_noise,
         "reason": "" if found is None else found.reason,
@@ -150,12 +194,14 @@ def result_of(told: Told, findings: Sequence[str]) -> dict[str, Any]:
             one.name: frames.horizon_s
             for one, frames in zip(record.episodes, record.estimate.recordings if record.estimate else (), strict=False)
         },
-        "findings": list(findings),
+        "findings": list(summary.findings),
+        "held_out": summary.held_out,
+        "next_steps": list(summary.next_steps),
         "episodes": {one.name: one.rms_mm for one in record.episodes},
     }
 
 
-def page_of(told: Told, findings: Sequence[str], episodes: Mapping[str, Episode], motions: Sequence[FittedMotion]) -> str:
+def page_of(told: Told, summary: Summary, episodes: Mapping[str, Episode], motions: Sequence[FittedMotion]) -> str:
     """
     Args:
         episodes: recording -> episode.
@@ -177,15 +223,15 @@ def page_of(told: Told, findings: Sequence[str], episodes: Mapping[str, Episode]
                 recording=recording,
                 episode=episodes[recording.name],
                 motion=motions[index],
+                intervals=told.intervals,
             )
         )
     return build_page(
         entries,
-        title="A cloth from its recordings",
+        title=f"Fit of {', '.join(one.name for one in record.episodes[:3])}{', …' * (len(record.episodes) > 3)}",
         cloud_points=1200,
         environment={"command": "diffcloud fit", "diffcloud": diffcloud.__version__},
-        findings=findings,
-        intervals=told.intervals,
+        summary=summary,
     )
 
 

@@ -54,6 +54,8 @@ class Overlay:
     """Frame that is shown first."""
     photographs: Sequence[bytes] = ()
     """A JPEG for each frame; none where there are no images."""
+    residuals_mm: Sequence[float | None] = ()
+    """RMS residual of each frame [mm]; None where the fit did not compare the frame."""
 
     def data(self) -> dict[str, Any]:
         """As the page's script takes it."""
@@ -62,6 +64,7 @@ class Overlay:
             "numbers": [int(number) for number in self.numbers],
             "times": [round(float(time), 3) for time in self.times],
             "opens": self.opens,
+            "residuals": [None if value is None else round(value, 1) for value in self.residuals_mm],
             "layers": [
                 {
                     "name": layer.name,

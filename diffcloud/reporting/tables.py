@@ -19,7 +19,9 @@ class Cell:
     """Below, smaller."""
     strong: bool = False
     episode: int | None = None
-    """Links to the overlay of this episode."""
+    """Shows this recording in the player."""
+    bar: tuple[float, float, float] | None = None
+    """Low end, value and high end of an interval, in per cent of the searched range."""
 
 
 UNKNOWN = Cell("–")

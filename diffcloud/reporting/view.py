@@ -20,16 +20,44 @@ from diffcloud.sim.simulate import rollout
 
 _BESIDE = 0.25
 """The table is drawn beyond the cloth by this part of its size: it has no end."""
+_AXES_M = 0.1
+_AXES_NAME = "axes of the world, 10 cm"
 
 
-def build_view(overlays: Sequence[Overlay], *, title: str, note: str, facts: Sequence[tuple[str, str]]) -> str:
-    """The page as HTML text.
+def build_view(
+    overlays: Sequence[Overlay],
+    *,
+    title: str,
+    note: str,
+    facts: Sequence[tuple[str, str]],
+    problems: Sequence[tuple[str, str]] = (),
+) -> str:
+    """Return the page as HTML text.
 
     Args:
         note: a sentence or two on what is shown.
         facts: lines of the table below, name and value.
+        problems: recording and sentence on what looks wrong.
     """
-    return render("view.html", title=title, note=note, facts=facts, overlays=[one.data() for one in overlays])
+    data = [one.data() for one in overlays]
+    return render("view.html", title=title, note=note, facts=facts, problems=problems, overlays=data)
+
+
+def proposed_layers(scenario: Scenario) -> list[Layer]:
+    """Return the cloth of a scenario before any motion, its held nodes, the table, and the directions of the world."""
+    scene = scenario.scene
+    cloth = Layer("proposed initial cloth", "mesh", [scene.mesh.nodes], "fitted", scene.mesh.faces)
+    held = held_layers(scene.mesh.nodes[None], np.unique(scene.handles.nodes).astype(np.int64))
+    return [cloth, *held, *table_layers(scenario, scene.mesh.nodes)]
+
+
+def world_axes(near: NDArray[np.floating]) -> list[Layer]:
+    """Return the directions of x, y and z of the world, 10 cm long, beside points [N, 3]."""
+    low = near.min(axis=0)
+    tips = low + _AXES_M * np.eye(3)
+    names = ("x", "y", "z")
+    lines = [Layer(_AXES_NAME, "line", [np.stack([low, tip])], "ink") for tip in tips]
+    return [Layer(_AXES_NAME, "marks", [tips], "ink", labels=names), *lines]
 
 
 def scene_layers(scenario: Scenario, episode: Episode, times: NDArray[np.float64]) -> list[Layer]:

@@ -125,11 +125,14 @@ class TestNewUser:
         folder, done = found
         page = (folder / "found" / "report.html").read_text()
         summary = page[page.index('id="summary"') :]
-        follows, transfers = (done.result["findings"][index].partition(":")[0] for index in (0, 2))
-        assert transfers.startswith(("The parameters predict other recordings", "The parameters do not predict"))
-        assert summary.index(follows) < summary.index(transfers) < summary.index("stretching: ")
+        follows, held_out = done.result["findings"][0], done.result["held_out"]
+        assert held_out.startswith(("The parameters predict other recordings", "The parameters do not predict"))
+        status = "Fits to the noise"
+        assert summary.index(status) < summary.index("stretching") < summary.index(held_out) < summary.index(follows)
         assert "fetch(" not in page[: page.index("<main>")]
-        assert done.result["findings"][0].startswith("The simulation follows first")
+        assert follows.startswith("The simulation follows first")
+        panel = " ".join(done.errors.replace("│", " ").split())
+        assert all(text in panel for text in (status, held_out, follows, *done.result["next_steps"], "found/report.html"))
         assert 0.2 < min(done.result["horizons_s"].values()) <= max(done.result["horizons_s"].values()) <= 0.8
 
     def test_a_mass_that_is_not_exact_is_a_source(self, found):
@@ -497,7 +500,7 @@ class TestTowelOfAnotherSimulator:
     def test_stiff_in_two_recordings(self, stiff):
         assert stiff["parameters"]["stretching"]["value"] == pytest.approx(40, rel=0.1)
         assert stiff["rms_mm"] < 4
-        assert stiff["findings"][2].startswith("The parameters predict other recordings of this motion")
+        assert stiff["held_out"].startswith("The parameters predict other recordings of this motion")
 
     @pytest.mark.slow
     def test_its_interval_holds_the_truth(self, stiff):

@@ -45,3 +45,10 @@ def test_help_lists_every_name():
     for words, names in {("fit",): SCENARIO_NAMES, ("network", "train"): (*MODEL_NAMES, *PROFILE_NAMES)}.items():
         text = CliRunner().invoke(app, [*words, "--help"]).stdout
         assert all(name in text for name in names)
+
+
+def test_the_help_of_a_command_fits_one_screen(monkeypatch):
+    """Of 50 lines, in a terminal of 120 columns."""
+    monkeypatch.setattr("typer.rich_utils.MAX_WIDTH", 120)
+    lines = {" ".join(words): CliRunner().invoke(app, [*words, "--help"]).stdout.count("\n") for words in LEAVES}
+    assert {name: count for name, count in lines.items() if count > 50} == {}

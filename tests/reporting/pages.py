@@ -10,7 +10,8 @@ import numpy as np
 from diffcloud.estimation.result import FittedMotion
 from diffcloud.io.episodes import Episode
 from diffcloud.mesh.topology import SurfaceMesh
-from diffcloud.reporting import EpisodeEntry, build_page
+from diffcloud.reporting.page import EpisodeEntry, Summary, build_page
+from diffcloud.reporting.uncertainty import NamedFit, parameters_table
 from tests.estimation.records import record_of, recording_of
 
 _TRIANGLE = np.array([[[0.0, 0, 0], [1, 0, 0], [0, 1, 0]]] * 2)
@@ -50,8 +51,19 @@ def entry(name="tan1", *, scenario="lift", fabric="tan", failures=()):
     )
 
 
-def page_of(*entries, comparison=None, title="Report"):
-    return build_page(entries or [entry()], title=title, cloud_points=4, environment={"torch": "2"}, comparison=comparison)
+SUMMARY = Summary(
+    status="Fits to the noise",
+    good=True,
+    residual="residual 10.0 mm RMS",
+    parameters=parameters_table([NamedFit("fit", entry().fit, None)]),
+    findings=["The simulation follows tan1."],
+    held_out="Not tested.",
+    next_steps=["Fit a second recording."],
+)
+
+
+def page_of(*entries, title="Report", **more):
+    return build_page(entries or [entry()], title=title, cloud_points=4, environment={"torch": "2"}, **more)
 
 
 def overlays_of(page):

@@ -14,11 +14,12 @@ import pytest
 from diffcloud.evaluation.summary import tables
 from diffcloud.io.camera_models import Intrinsics
 from diffcloud.io.raw_episodes import CameraInfo, RawEpisodeWriter
-from diffcloud.reporting import ComparisonEntry, comparison_figures
+from diffcloud.reporting.comparison import ComparisonEntry
+from diffcloud.reporting.figures import comparison_figures
 from diffcloud.reporting.overlay import Overlay, recorded_layers
 from diffcloud.reporting.view import build_view
 from tests.evaluation.records import records
-from tests.reporting.pages import entry, page_of
+from tests.reporting.pages import SUMMARY, entry, page_of
 
 CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
 pytestmark = [
@@ -64,7 +65,8 @@ def pages():
     told = tables(records(), {})
     failures = ["data/regressors/fold/" + 90 * "n" + ".safetensors: no such file"]
     compared = ComparisonEntry(told, records(), failures, comparison_figures(told, records(), {}))
-    return {"report": page_of(entry("tan1"), entry("tan2"), comparison=compared), "view": view}
+    pipeline = page_of(entry("tan1"), entry("tan2"), comparison=compared)
+    return {"pipeline": pipeline, "fit": page_of(entry("tan1"), summary=SUMMARY, title="Fit of tan1"), "view": view}
 
 
 @pytest.fixture(scope="module")
@@ -82,7 +84,7 @@ def browser():
         one.close()
 
 
-@pytest.fixture(params=["report", "view"])
+@pytest.fixture(params=["pipeline", "fit", "view"])
 def page(request, browser, tmp_path):
     """A page that is open, with what went wrong in `wrong`."""
     file = tmp_path / "page.html"
@@ -94,9 +96,37 @@ def page(request, browser, tmp_path):
     tab.on("request", lambda asked: tab.wrong.append(asked.url) if asked.url.startswith("http") else None)
     tab.goto(file.as_uri())
     tab.wait_for_selector("#scene canvas")
+    tab.name = request.param
     yield tab
     assert tab.wrong == []
     tab.close()
+
+
+def unfolded(page):
+    page.evaluate("document.querySelectorAll('details').forEach(one => { one.open = true; })")
+    page.wait_for_timeout(300)
+
+
+def test_the_first_screen_has_status_parameters_and_picture(page):
+    """Of a window of 1280 x 800 pixels; with everything folded, a page is at most four of them."""
+    page.set_viewport_size({"width": 1280, "height": 800})
+    page.wait_for_timeout(300)
+    shown = [".problems"] if page.name == "view" else [".status", "#parameters tbody tr", ".findings li"]
+    for selector in (*shown, "#layers input", "#scene canvas"):
+        assert page.locator(selector).first.bounding_box()["y"] < 800, selector
+    scene = page.locator("#scene").first.bounding_box()
+    assert scene["y"] + scene["height"] <= 800
+    assert page.evaluate("document.documentElement.scrollHeight") <= 4 * 800
+
+
+def test_every_picture_has_a_legend(page):
+    named = page.evaluate("[...document.querySelectorAll('#layers label')].map(one => one.textContent)")
+    assert set(named) == set(page.evaluate("overlays[current].layers.map(one => one.name)"))
+    unfolded(page)
+    plots = page.locator(".plot.js-plotly-plot")
+    assert plots.count() == (0 if page.name == "view" else 2)
+    for index in range(plots.count()):
+        assert plots.nth(index).locator(".legend .legendtext").count() > 0
 
 
 def test_the_scene_is_drawn(page):
@@ -125,6 +155,7 @@ def test_the_keyboard_is_enough(page):
     page.keyboard.press("Space")
     assert box.is_checked() != was
     assert was in page.evaluate("document.querySelector('#scene').data.map(one => !one.visible)")
+    unfolded(page)
     heads = page.locator("#fits thead button")
     if heads.count():  # the report's table
         heads.nth(1).focus()
@@ -133,11 +164,13 @@ def test_the_keyboard_is_enough(page):
 
 
 def test_everything_has_a_name(page):
+    unfolded(page)
     assert page.evaluate(_NAMELESS) == []
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 def test_text_stands_out(page, scheme):
+    unfolded(page)
     page.emulate_media(color_scheme=scheme)
     assert page.evaluate(_FAINT, 21.1)  # more than black on white
     assert page.evaluate(_FAINT, CONTRAST) == []
@@ -145,6 +178,7 @@ def test_text_stands_out(page, scheme):
 
 @pytest.mark.parametrize("width", [1280, 390])
 def test_nothing_leaves_the_page_sideways(page, width):
+    unfolded(page)
     page.set_viewport_size({"width": width, "height": 800})
     page.wait_for_timeout(300)
     assert page.evaluate("document.documentElement.scrollWidth") <= width
@@ -153,6 +187,7 @@ def test_nothing_leaves_the_page_sideways(page, width):
 
 def test_a_narrow_table_names_each_cell(page):
     """A table that does not fit has a line per cell, with its heading; a wide window makes it a table again."""
+    unfolded(page)
     page.set_viewport_size({"width": 390, "height": 800})
     cells = page.locator("table.sorts.cards tbody tr:first-child td")
     heads = page.locator("table.sorts.cards thead th")

@@ -10,8 +10,8 @@ import pytest
 
 from diffcloud.estimation.record import History
 from diffcloud.evaluation.summary import tables
-from diffcloud.reporting import ComparisonEntry, comparison_figures
-from diffcloud.reporting.comparison import comparison_failures, comparison_overview
+from diffcloud.reporting.comparison import ComparisonEntry, comparison_failures, comparison_overview
+from diffcloud.reporting.figures import comparison_figures
 from tests.evaluation.records import record, records
 from tests.reporting.pages import main_of, page_of
 

@@ -15,7 +15,7 @@ from matplotlib.axes import Axes
 from diffcloud.estimation.pose import PoseSpace
 from diffcloud.estimation.result import recorded_pose
 from diffcloud.io.episodes import Episode
-from diffcloud.reporting import overlay_figure
+from diffcloud.reporting.figures import overlay_figure
 from diffcloud.reporting.overlay import Layer, Overlay, held_layers, recorded_layers, states_at
 from diffcloud.reporting.view import build_view, scene_layers, unposed_layer
 from diffcloud.scene.scenarios import load_scenario
@@ -83,7 +83,7 @@ def test_the_cloth_follows_the_recorded_gripper():
     assert np.ptp(named["table"].frames[0][:, 2]) == 0
 
 
-def displaced_fold(loss_frames=(2,), compared=(1, 2, 3, 4)):
+def displaced_fold(compared=(1, 2, 3, 4), residuals=(5.0, 9.0, 7.0, 6.0)):
     """A fit of four frames whose recorded gripper is a point 71 mm above the node that it holds."""
     one = entry(scenario="fold")
     frames = np.arange(5)
@@ -92,8 +92,8 @@ def displaced_fold(loss_frames=(2,), compared=(1, 2, 3, 4)):
     gripper = nodes[:, 1:2] + [0, 0, 0.071]
     motion = replace(one.motion, nodes=nodes, start_nodes=nodes, times=times, held=np.array([1]))
     episode = Episode.from_frames([np.zeros((4, 3))] * 5, times, gripper=gripper)
-    recording = one.recording.model_copy(update={"frames": list(compared)})
-    return replace(one, episode=episode, motion=motion, recording=recording, loss_frames=loss_frames)
+    recording = one.recording.model_copy(update={"frames": list(compared), "frame_rms_mm": list(residuals)})
+    return replace(one, episode=episode, motion=motion, recording=recording)
 
 
 class TestShown:
@@ -109,13 +109,12 @@ class TestShown:
         np.testing.assert_array_equal(np.transpose(path), cloth[:, :, 1])
         assert not layers["gripper, as recorded", "marks"]["shown"]
 
-    @pytest.mark.parametrize(
-        ("loss_frames", "compared", "shown"),
-        [((2,), (1, 2, 3, 4), 2), ((-1,), (1, 2, 3, 4), 4), ((1, 3), (1, 2, 3, 4), 3), ((4,), (1, 2, 3), 3)],
-    )
-    def test_the_loss_frame_is_shown_if_it_was_compared(self, loss_frames, compared, shown):
-        one = displaced_fold(loss_frames, compared)
-        assert overlays_of(page_of(one))[0]["opens"] == one.shown_frame == shown
+    @pytest.mark.parametrize(("compared", "residuals", "shown"), [((1, 2, 3, 4), (5, 9, 7, 6), 2), ((3, 4), (1, 2), 4)])
+    def test_the_frame_with_the_largest_residual_is_shown(self, compared, residuals, shown):
+        one = displaced_fold(compared, residuals)
+        (told,) = overlays_of(page_of(one))
+        assert told["opens"] == one.shown_frame == shown
+        assert told["residuals"] == [dict(zip(compared, residuals, strict=True)).get(frame) for frame in range(5)]
 
     def test_the_figure_has_the_same_frame(self, monkeypatch):
         one, drawn = displaced_fold(), []
@@ -195,6 +194,9 @@ class TestBrowser:
         assert found == ["frame 3, 0.10 s", 4, False, "frame 7, 0.40 s", 5, True, False, True]
 
     def test_the_report_draws_its_cloth_and_its_curves(self, tmp_path):
-        script = "return [byId('scene').data.map(one => one.type), byId('curves').data.length, pick.options.length]"
+        script = (
+            "document.querySelectorAll('details').forEach(one => { one.open = true; }); plots();"
+            "return [byId('scene').data.map(one => one.type), byId('curves').data.length, pick.options.length]"
+        )
         found = self.seen(tmp_path, page_of(entry("one"), entry("two")), script)
         assert found == [["scatter3d", "mesh3d", "mesh3d", "scatter3d", "scatter3d"], 2, 2]
