@@ -120,7 +120,7 @@ def test_settings_come_from_the_parameter_file_and_options_win(work):
     ("arguments", "message"),
     [
         (("--parameters", "weight"), "Unknown parameter 'weight'"),
-        (("--distribution", "gauss"), "distribution: Input should be 'uniform', 'sobol', 'logarithmic' or 'modes'"),
+        (("--distribution", "gauss"), "--distribution: must be 'uniform', 'sobol', 'logarithmic' or 'modes' (got 'gauss')"),
         (("--distribution", "modes"), "not for 'small'"),
         (("--uncertain", "stretching=1.5x"), "leave out stretching"),
         (("--uncertain", "air_density=0.5x"), "air_density takes the factor within which it is known"),

@@ -328,7 +328,7 @@ class TestBadInput:
             ),
             ((*fit, "fold.safetensors"), "fold.safetensors was trained for fold, not for small"),
             ((*TRAIN, "--scene", "lift"), "sim holds draws of small, not of lift"),
-            ((*TRAIN, "--profile", "fast"), "profile: Input should be 'quick', 'reduced' or 'paper'"),
+            ((*TRAIN, "--profile", "fast"), "--profile: must be 'quick', 'reduced' or 'paper' (got 'fast')"),
             ((*TRAIN, "--model", "transformer"), "Unknown model 'transformer'"),
         ):
             done = run(*arguments, code=1)

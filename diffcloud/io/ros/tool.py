@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,7 +29,8 @@ _GAP_S = 0.2
 """A tool that accelerates by 1 m/s² leaves a straight line by 5 mm in this time."""
 
 
-class StampedPose(NamedTuple):
+@dataclass(frozen=True)
+class StampedPose:
     """What a message of `POSES` states."""
 
     frame: str
