@@ -82,9 +82,9 @@ def page(found: Mapping[str, FitRecord]) -> str:
             "Default fits of the 20 real recordings that were published with the paper: two lifts and two folds of each of "
             "five fabrics, in metres, under the recorded path of the gripper (scenarios "
             "[`recorded_lift` and `recorded_fold`](../scenarios.md#the-published-recordings)). The import corrects one "
-            "camera against the other ([published-data.md](../published-data.md)). RMS is over both directions and the frames "
-            "up to the fit's [horizon](../solver.md#likelihood). Frames with little of the cloth above the height where the "
-            "clouds were cut off do not count. Each distance is capped at 5 cm ([the loss](../concepts.md#the-loss)).",
+            "camera against the other ([published-data.md](../published-data.md)). RMS is over both directions and the "
+            "frames up to the fit's [horizon](../solver.md#likelihood). Frames with little of the cloth above the height "
+            "where the clouds were cut off do not count. Each distance is capped at 5 cm ([the loss](../concepts.md#the-loss)).",
             "",
             f"Mean RMS: {_mean(lifts):.1f} mm (lifts), {_mean(folds):.1f} mm (folds).",
             "",
