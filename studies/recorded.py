@@ -84,7 +84,8 @@ def page(found: Mapping[str, FitRecord]) -> str:
             "[`recorded_lift` and `recorded_fold`](../scenarios.md#the-published-recordings)). The import corrects one "
             "camera against the other ([published-data.md](../published-data.md)). RMS is over both directions and the "
             "frames up to the fit's [horizon](../solver.md#likelihood). Frames with little of the cloth above the height "
-            "where the clouds were cut off do not count. Each distance is capped at 5 cm ([the loss](../concepts.md#the-loss)).",
+            "where the clouds were cut off do not count. Each distance is capped at 5 cm "
+            "([the loss](../concepts.md#the-loss)).",
             "",
             f"Mean RMS: {_mean(lifts):.1f} mm (lifts), {_mean(folds):.1f} mm (folds).",
             "",
