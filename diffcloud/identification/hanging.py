@@ -1,8 +1,8 @@
-"""How a recorded cloth hangs at its start, found by hypotheses: each is simulated until it hangs still and compared.
+"""Search for the initial state of a recorded cloth that hangs from its gripper.
 
-A cloth may hang from a whole side, from the two corners of a side, taut or slack, or from one corner. The hypothesis whose
-cloth is nearest to the first cloud wins. A side and its two corners often look alike at rest. Then the recorded motion
-decides, and where it does not either, the side.
+A cloth may hang from a whole side, from the two corners of a side (taut or slack), or from one corner. Each hypothesis is
+simulated until the cloth is at rest, aligned with the first cloud, and ranked by its RMS distance. A side and its two
+corners often look alike at rest. Then the recorded motion decides. If that is not clear either, the side is chosen.
 """
 
 from __future__ import annotations
@@ -31,43 +31,43 @@ from diffcloud.sim.simulate import rollout
 Floats = NDArray[np.float64]
 
 HANG_FIELDS = ("held", "side", "rim_m", "yaw_deg", "span", "rate_hz", "frames", "steps_per_frame", "path")
-"""Of a scenario, those that `find_hanging` finds."""
+"""Scenario fields that `find_hanging` determines."""
 _STILL_M = 0.005
-"""A gripper that has moved less stands still."""
+"""Displacement [m] below which the gripper is at rest."""
 _FIRST_FRAMES, _FIRST_POINTS = 10, 3000
 _UPRIGHT = 0.4
-"""Height of a hanging cloud over its extent in the horizontal, at least."""
+"""Minimum ratio of height to horizontal extent of a hanging cloud."""
 _RIM = 0.12
-"""Part of the height in which the points of the held side lie."""
+"""Fraction of the height, from the top, that shows the held side."""
 _EDGE = 0.01
-"""Part of the points beyond each side: noise."""
+"""Quantile of coordinates that is taken as the end of the cloud, because of noise."""
 _TAUT = 0.96
-"""A span above is taken as taut."""
+"""Span above which the cloth counts as taut."""
 _CAP_M, _WORST_M = 0.05, 0.025
-"""Of one distance; and of the RMS distance of a hypothesis that can be right."""
+"""Cap of a single distance, and largest accepted RMS distance of the best hypothesis [m]."""
 _TIE, _SAME = 1.25, 1.1
-"""Factors within which hypotheses count as equal: at rest, and in motion."""
+"""Factors of the RMS distance within which hypotheses count as equal, at rest and in motion."""
 _MOTION_FRAMES, _MOTION_S = 15, 3.0
 _ALIGNING = 8
-"""Rounds in which a settled cloth is moved and turned onto the cloud."""
+"""Number of iterations of the alignment."""
 _FAR_M, _NEAR_M = 0.25, 0.03
-"""Distances of the held side from the gripper: refused, and warned of."""
+"""Distances [m] of the held part from the gripper: above the first, the recording is refused, above the second, a warning."""
 _LONGEST_STEP_S = 0.02
-"""A hanging cloth without contact moves smoothly: longer steps would damp its swing."""
+"""Longest time step [s]. Longer steps would damp the swing."""
 _REST_S = 1.0
-"""Before the first cloud, in which the cloth comes to rest with the parameters of a fit: its start is that of the nominal
-material."""
+"""Simulated time [s] before the first cloud. The initial state is the equilibrium of the nominal material, and in this time
+the cloth comes to rest with the parameters of the fit."""
 _PREPARED = "rest_s"
-"""Of an episode's meta: this time was added."""
+"""Key in the meta of a prepared episode: the time that was added."""
 _SIGMAS = {"x": 0.01, "y": 0.01, "z": 0.01, "yaw": 0.1, "tilt_x": 0.035, "tilt_y": 0.035}
-"""Standard deviations of the place of the held part and of the cameras' frame against gravity [m, rad]."""
+"""Prior standard deviations of the pose [m, rad]: of the held part, and of the cameras relative to gravity."""
 _LAG_S = (0.05, 0.01)
-"""Standard deviation of the lag that all clouds share [s], and where their stamps were corrected."""
+"""Prior standard deviation [s] of the common lag, without and with corrected stamps."""
 
 
 @dataclass(frozen=True)
 class _Hypothesis:
-    """One way to hang, its settled cloth, and how far the first cloud is from it."""
+    """A way to hang, aligned with the first cloud, and its RMS distance."""
 
     options: HangScenario
     rms_m: float
@@ -80,7 +80,7 @@ class _Hypothesis:
 
 
 def hangs(episode: Episode) -> bool:
-    """Whether the first cloud is upright and below the gripper."""
+    """Return whether the first cloud is upright and below the gripper."""
     if episode.gripper is None:
         return False
     cloud = _first_cloud(episode)
@@ -90,7 +90,7 @@ def hangs(episode: Episode) -> bool:
 
 
 def hanging_size(episode: Episode) -> tuple[float, float]:
-    """Extents of the first cloud [m], the longer one first: sides of a cloth that hangs from one of its sides."""
+    """Return the extents [m] of the first cloud, the longer one first. They are the sides of a cloth that hangs from a side."""
     cloud = _first_cloud(episode)
     along, _ = _axes(cloud)
     sides = [float(np.ptp(np.quantile(values, [_EDGE, 1 - _EDGE]))) for values in (cloud @ along, cloud[:, 2])]
@@ -98,12 +98,12 @@ def hanging_size(episode: Episode) -> tuple[float, float]:
 
 
 def prepared(episode: Episode) -> tuple[Episode, str]:
-    """A recording of a hanging cloth as fits take it: stamps corrected, time to come to rest, and priors of its pose.
+    """Prepare the recording of a hanging cloth for fits. A prepared recording is returned unchanged.
 
-    A recording that is prepared already stays as it is.
+    Late stamps are corrected, time to come to rest is added before the first cloud, and priors of the pose are stated.
 
     Returns:
-        The episode, and a sentence on its stamps; empty where they are right.
+        The episode, and a sentence about corrected stamps, which is empty if none were corrected.
     """
     if _PREPARED in episode.meta:
         return episode, ""
@@ -114,14 +114,15 @@ def prepared(episode: Episode) -> tuple[Episode, str]:
 
 
 def find_hanging(episode: Episode, cloth: Mapping[str, Any]) -> Layout:
-    """How the cloth of a recording hangs at its start.
+    """Determine how the cloth of a recording hangs at the start.
 
     Args:
-        episode: in metres, z up, with the track of one gripper.
-        cloth: fields of a `hang` scenario that all recordings share, such as its size and material.
+        episode: recording in metres, z up, with the track of one gripper.
+        cloth: fields of a `hang` scenario that all recordings share, such as size and material.
 
     Raises:
-        EpisodeError: no way to hang is within 25 mm of the first cloud, or the gripper is elsewhere; gives all distances.
+        EpisodeError: no hypothesis is within 25 mm of the first cloud, or the gripper is too far from the held part. The
+            message has all distances.
     """
     assert episode.gripper is not None
     cloud, gripper = _first_cloud(episode), episode.gripper[:, 0]
@@ -180,7 +181,7 @@ def find_hanging(episode: Episode, cloth: Mapping[str, Any]) -> Layout:
 
 
 def _first_cloud(episode: Episode) -> Floats:
-    """[N, 3] points of the frames before the gripper moves."""
+    """Return points [N, 3] of the frames before the gripper moves [m]."""
     assert episode.gripper is not None
     way = np.linalg.norm(episode.gripper[:, 0] - episode.gripper[0, 0], axis=1)
     still = int(np.argmax(way > _STILL_M)) if (way > _STILL_M).any() else episode.frame_count
@@ -189,14 +190,14 @@ def _first_cloud(episode: Episode) -> Floats:
 
 
 def _axes(cloud: Floats) -> tuple[Floats, Floats]:
-    """The horizontal direction along which a cloud is longest, and the one across it; [3] each."""
+    """Return the horizontal direction [3] of the longest extent of a cloud, and the one perpendicular to it."""
     level = cloud[:, :2] - cloud[:, :2].mean(axis=0)
     x, y = np.linalg.eigh(level.T @ level)[1][:, -1]
     return np.array([x, y, 0.0]), np.array([-y, x, 0.0])
 
 
 def _ways(cloud: Floats, size: tuple[float, float]) -> list[dict[str, Any]]:
-    """Fields of each way to hang."""
+    """Return the scenario fields of each hypothesis."""
     along, normal = _axes(cloud)
     yaw = math.degrees(math.atan2(along[1], along[0]))
     low, top = np.quantile(cloud[:, 2], [_EDGE, 1 - _EDGE])
@@ -218,7 +219,7 @@ def _ways(cloud: Floats, size: tuple[float, float]) -> list[dict[str, Any]]:
 
 
 def _aligned(options: HangScenario, cloud: Floats) -> _Hypothesis:
-    """The hypothesis moved and turned about the vertical so that its settled cloth is nearest to the cloud."""
+    """Align a settled cloth with the cloud by translation and rotation about the vertical (ICP)."""
     scene = hang_scenario(options).scene
     nodes, faces, rim = scene.mesh.nodes, scene.mesh.faces, np.array(options.rim_m)
     turned = 0.0
@@ -245,13 +246,16 @@ def _aligned(options: HangScenario, cloud: Floats) -> _Hypothesis:
 
 
 def _on_surface(points: Floats, nodes: Floats, faces: NDArray[np.int64]) -> Floats:
-    """[N, 3] the nearest place of a mesh to each point."""
+    """Return the nearest point [N, 3] on a mesh to each of N points."""
     found, weights = find_on_surface(points[None], NO_GUESS, np.ascontiguousarray(nodes)[None], faces)
     return np.asarray((nodes[faces[found[0]]] * weights[0][..., None]).sum(axis=1))
 
 
 def _by_motion(ties: list[_Hypothesis], episode: Episode) -> tuple[_Hypothesis, str]:
-    """The hypothesis that moves most like the recording; of those that move alike, the one with the most held nodes."""
+    """Return the hypothesis with the motion nearest to the recording, and the reason in words.
+
+    Among hypotheses that move alike, the one with the most held nodes is chosen.
+    """
     first = float(episode.times[0])
     frames = [int(f) for f in np.flatnonzero(episode.times <= first + _MOTION_S)]
     frames = frames[:: max(len(frames) // _MOTION_FRAMES, 1)]

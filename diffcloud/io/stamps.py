@@ -1,4 +1,8 @@
-"""When clouds were taken, where their stamps are late: found from the upper end of a cloth that hangs from its gripper."""
+"""Correction of late time stamps of clouds, for a cloth that hangs from its gripper.
+
+A cloud is often stamped when it is published. The upper end of a hanging cloth is at the gripper, so the recorded track
+of the gripper tells when the cloud was taken.
+"""
 
 from __future__ import annotations
 
@@ -13,35 +17,36 @@ from diffcloud.io.episodes import Episode
 Floats = NDArray[np.float64]
 
 _PART = 1 / 8
-"""Of the points of a cloud, those that show its upper end, and as many below them."""
+"""Fraction of the points of a cloud that show its upper end, and of the next ones below."""
 _END_M = 0.006
-"""Standard deviation of the upper end against the gripper."""
+"""Standard deviation [m] of the upper end relative to the gripper."""
 _JITTER_S = 0.04
-"""Standard deviation of one cloud's lag about the expected lag."""
+"""Standard deviation [s] of the lag of one cloud about the expected lag."""
 _MOST_S, _GRID_S = 0.8, 0.005
-"""Lags that are looked for: up to the first, in steps of the second."""
+"""Largest common lag that is tried, and step between trial lags [s]."""
 _MOVES_M_S = 0.2
-"""A gripper that moves faster shows the time."""
+"""Minimum speed [m/s] at which the gripper shows the time."""
 _FEW = 10
-"""Clouds of a moving gripper, below which only the common lag is known."""
+"""Minimum number of clouds with a moving gripper. With fewer, the lags are unknown."""
 _LATE_S = 0.1
-"""A smaller common lag is left to the fit: what hangs from a corner turns under it, which looks like a small lag."""
+"""Smallest median lag [s] that is corrected. A cloth that hangs from a corner swings about it, which looks like a small
+lag. Smaller lags are estimated by the fit."""
 _OUTLIER_S = 0.15
-"""A lag that is farther from the median does not tell the expected lag."""
+"""Lags farther from the median [s] are ignored when the expected lag is estimated."""
 _EVEN_S = 0.005
-"""Standard deviation of the times between clouds, below which they predict nothing."""
+"""Minimum standard deviation [s] of the intervals between clouds at which they predict the lag."""
 _LONGEST_S = 0.25
-"""A longer time since the cloud before says nothing about the lag."""
+"""Longest interval [s] since the previous cloud that affects the lag."""
 
 
 @dataclass(frozen=True)
 class Lags:
-    """How late the stamps of F clouds are."""
+    """Lags of the time stamps of F clouds."""
 
     seconds: Floats
-    """[F] [s]"""
+    """[F] stamp minus true time [s]."""
     spread_m: tuple[float, float]
-    """Mean distance of the upper end from its usual place under the gripper [m], before and after."""
+    """Mean distance [m] of the upper end from its median position relative to the gripper, before and after correction."""
 
     @property
     def sentence(self) -> str:
@@ -54,18 +59,14 @@ class Lags:
 
 
 def corrected_stamps(episode: Episode) -> tuple[Episode, Lags | None]:
-    """The recording of a hanging cloth with each cloud at the time at which it was taken.
-
-    A cloud is often stamped when it is published. Its upper end is at the gripper, so the track tells when it was taken. A
-    cloud also waits until the cloud before it is processed, so the time since then predicts a part of the lag. Where the
-    gripper stands still, this prediction alone counts.
+    """Return the recording of a hanging cloth with corrected time stamps, and the lags.
 
     Args:
-        episode: with the track of one gripper, in metres, z up.
+        episode: recording in metres, z up, with the track of one gripper.
 
     Returns:
-        The episode, with times from 0 and the gripper at these times, and the lags; the episode itself and None, where the
-        clouds are not late or the gripper never moves fast enough to tell.
+        The episode with times from 0 and the gripper interpolated at these times, and the lags. If the clouds are not
+        late, or the gripper moves too slowly, the unchanged episode and None.
     """
     if episode.gripper is None or episode.frame_count < _FEW:
         return episode, None
@@ -93,7 +94,7 @@ def corrected_stamps(episode: Episode) -> tuple[Episode, Lags | None]:
 
 
 def upper_end(points: NDArray[np.floating]) -> Floats:
-    """[3] the middle of a cloud's upper end: points [N, 3] near it, continued upwards by half their height."""
+    """Return the position [3] of the upper end of a cloud [N, 3], extrapolated from its highest points."""
     order = points[:, 2].argsort()[::-1]
     count = max(round(_PART * len(points)), 1)
     return np.asarray(
@@ -102,10 +103,14 @@ def upper_end(points: NDArray[np.floating]) -> Floats:
 
 
 def stamp_lags(episode: Episode) -> Lags | None:
-    """How late each cloud of a hanging cloth is stamped; None where the gripper moves too little to tell.
+    """Estimate the lag of each cloud of a hanging cloth, or return None if the gripper moves too little.
+
+    A cloud waits until the previous one is processed. So a line through the lags over the intervals between clouds gives
+    the expected lag. Each lag minimizes the distance of the upper end from the gripper, with a Gaussian prior about the
+    expected lag. While the gripper is at rest, the prior decides.
 
     Args:
-        episode: with the track of one gripper, in metres, z up.
+        episode: recording in metres, z up, with the track of one gripper.
     """
     assert episode.gripper is not None
     stamps, track = episode.times, CubicSpline(episode.times, episode.gripper.mean(axis=1))

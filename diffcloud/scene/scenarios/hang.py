@@ -1,4 +1,4 @@
-"""A rectangular cloth that hangs at rest from a gripper, which then moves it: the built-in `hang`."""
+"""Built-in scenario `hang`: a rectangular cloth that hangs at rest from a gripper, which then moves it."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ from diffcloud.sim.system import State
 HeldPart = Literal["edge", "corners", "corner"]
 
 _STEP_S, _CHUNK, _LONGEST_S = 0.05, 20, 12.0
-"""Settling: steps of backward Euler, which damps; so many at a time; and when it ends in any case."""
+"""Settling uses backward Euler, which damps: time step [s], steps per chunk, and longest time [s]."""
 _AT_REST = 1e-3
-"""[m/s] A cloth that moves slower is at rest."""
+"""Largest speed [m/s] of a node at which the cloth counts as at rest."""
 _UNEVEN_M = 1e-3
-"""Standard deviation of noise on a cloth held at a corner: without it, the cloth would stay in an unstable plane."""
+"""Standard deviation [m] of noise on a cloth held at a corner. Without noise, it would stay in an unstable plane."""
 
 
 class HangScenario(ScenarioOptions):
@@ -37,17 +37,17 @@ class HangScenario(ScenarioOptions):
     nodes: tuple[Annotated[int, Field(ge=2, le=500)], Annotated[int, Field(ge=2, le=500)]] = (7, 7)
     """Node counts along x and y."""
     held: HeldPart = "edge"
-    """What the gripper holds: a whole side, as a bar does, both corners of that side, or one corner."""
+    """Held part: a whole side (as by a bar), both corners of that side, or one corner."""
     side: Literal["x", "y"] = "x"
-    """The side that is held, or whose corners are: along the cloth's own x or y."""
+    """Direction of the held side in the cloth's own axes."""
     rim_m: tuple[Coordinate, Coordinate, Coordinate] = (0.0, 0.0, 0.6)
-    """Middle of the held side, or the held corner."""
+    """Midpoint of the held side, or the held corner."""
     yaw_deg: Annotated[float, Field(ge=-360, le=360)] = 0.0
-    """Direction of the held side about the vertical; 0 is along the world's x."""
+    """Direction of the held side: rotation about the vertical from the world's x axis."""
     span: Annotated[float, Field(gt=0.3, le=1)] = 1.0
-    """Distance of the held corners over the length of their side. Below 1 the cloth bows to the left of that direction."""
+    """Ratio of the distance of the held corners to the length of their side. Below 1, the cloth bows to the left."""
     grip_m: Length = GRIP_M
-    """Size of the grasp at a corner, which lets the cloth turn."""
+    """Size of the grasp at a corner, which lets the cloth rotate."""
     air: Literal["none", "drag", "still"] = "still"
     self_contact: bool = False
 
@@ -61,10 +61,10 @@ HANG = HangScenario(
 
 
 def hang_scenario(options: HangScenario) -> Scenario:
-    """The scenario of a hanging cloth, which begins in its equilibrium for the scenario's material.
+    """Build the scenario. It starts in the equilibrium of the scenario's material.
 
     Raises:
-        SceneError: a side that is held and shorter than its cloth, or a cloth that does not come to rest.
+        SceneError: a held edge has a span below 1, or the simulation of the settling cloth diverges.
     """
     if options.held == "edge" and options.span < 1:
         raise SceneError(f"Scenario {options.name}: a held edge is straight, so its span is 1; got {options.span:g}.")
@@ -86,7 +86,7 @@ def hang_scenario(options: HangScenario) -> Scenario:
 
 
 def _held(options: HangScenario) -> Sequence[int]:
-    """The nodes that the gripper holds."""
+    """Return the nodes that the gripper holds."""
     columns, rows = options.nodes
     edge = (
         range((rows - 1) * columns, rows * columns) if options.side == "x" else range(columns - 1, rows * columns, columns)
@@ -101,7 +101,7 @@ def _held(options: HangScenario) -> Sequence[int]:
 
 
 def _unfolded(options: HangScenario, verts: NDArray[np.float64]) -> NDArray[np.float64]:
-    """[V, 3] nodes from which the cloth settles, for verts [V, 2] in material space."""
+    """Return the nodes [V, 3] before settling, for verts [V, 2] in material space."""
     yaw = np.deg2rad(options.yaw_deg)
     along, normal = np.array([np.cos(yaw), np.sin(yaw), 0.0]), np.array([-np.sin(yaw), np.cos(yaw), 0.0])
     size = np.array(options.size_m)
@@ -120,7 +120,7 @@ def _unfolded(options: HangScenario, verts: NDArray[np.float64]) -> NDArray[np.f
 
 
 def settled(scene: Scene) -> NDArray[np.float64]:
-    """[V, 3] positions in which the cloth hangs at rest [m], with its grippers still.
+    """Return the positions [V, 3] of the cloth at rest [m], with its grippers fixed.
 
     Raises:
         DivergedError: the simulation diverged.
