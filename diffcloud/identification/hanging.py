@@ -51,7 +51,7 @@ _MOTION_FRAMES, _MOTION_S = 15, 3.0
 _ALIGNING = 8
 """Number of iterations of the alignment."""
 _FAR_M, _NEAR_M = 0.25, 0.03
-"""Distances [m] of the held part from the gripper: above the first, the recording is refused, above the second, a warning."""
+"""Distances [m] of the held part from the gripper: refused above the first, and a warning above the second."""
 _LONGEST_STEP_S = 0.02
 """Longest time step [s]. Longer steps would damp the swing."""
 _REST_S = 1.0
