@@ -90,7 +90,7 @@ def hangs(episode: Episode) -> bool:
 
 
 def hanging_size(episode: Episode) -> tuple[float, float]:
-    """Return the extents [m] of the first cloud, the longer one first. They are the sides of a cloth that hangs from a side."""
+    """Return the extents [m] of the first cloud, longer one first: the sides of a cloth that hangs from a side."""
     cloud = _first_cloud(episode)
     along, _ = _axes(cloud)
     sides = [float(np.ptp(np.quantile(values, [_EDGE, 1 - _EDGE]))) for values in (cloud @ along, cloud[:, 2])]
