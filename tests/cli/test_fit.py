@@ -532,7 +532,7 @@ class TestTowelOfAnotherSimulator:
         assert "4 of 31 clouds are empty (frames 0, 1, 2, 3)" in told
 
 
-@pytest.mark.slow
+@pytest.mark.longest
 def test_how_long_it_takes_is_measured():
     told = study("bench", "--fit", "--threads", 1)
     assert told.result["threads"] == 1

@@ -200,7 +200,7 @@ def test_a_fit_starts_from_a_prediction_and_the_report_shows_both(work):
     run("pipeline.report", "--params", "params.yaml")
     page = (work / "reports/index.html").read_text()
     head, *scripts = page.split("<script>")
-    assert "Predictions of the regressors" in head
+    assert "<summary>Networks</summary>" in head
     assert '"small / mlp"' in scripts[-1]
     assert "{{" not in head + scripts[-1]
 
