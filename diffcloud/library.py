@@ -30,9 +30,9 @@ from diffcloud.estimation.task import FitTask, Recording, compared
 from diffcloud.evaluation.intervals import Intervals, draws, intervals_of, stated_parameters, worded
 from diffcloud.evaluation.methods import space_of
 from diffcloud.identification import (
-    find_hanging,
     fit_settings,
     found_cloth,
+    found_layout,
     known_grip,
     prepared,
     with_density,
@@ -44,7 +44,6 @@ from diffcloud.io.imports import cloud_folder
 from diffcloud.reporting.fit_page import Status, Told, page_of, summary_of
 from diffcloud.scene.scenarios import Scenario, load_scenario
 from diffcloud.scene.scenarios.catalogue import make_scenario, own_options
-from diffcloud.scene.scenarios.layout import find_layout
 from diffcloud.sim.properties import PARAMETERS
 from diffcloud.sim.simulate import Rollout, rollout
 from diffcloud.simulators.export.cloth import fitted_cloth
@@ -253,14 +252,8 @@ def find_scenes(
     if weighed is not None and weighed[1]:
         cloth = with_density(cloth, *weighed)
     scenes = list[Scene]()
-    sides = (float(cloth["size_m"][0]), float(cloth["size_m"][1]))
     for number, recording in enumerate(recordings, 1):
-        if cloth["base"] == "hang":
-            recording, stamps = prepared(recording)
-            layout = find_hanging(recording, cloth)
-            layout = replace(layout, warnings=(*filter(None, [stamps]), *layout.warnings))
-        else:
-            layout = find_layout(recording, sides, float(cloth["grip_m"]))
+        layout = found_layout(recording, cloth)
         for message in layout.warnings:
             warnings.warn(f"Recording {number}: {message}.", stacklevel=2)
         options = {**cloth, **{name: found.value for name, found in layout.fields.items()}}

@@ -1,9 +1,10 @@
 """Default assumptions for estimating the parameters of a cloth from recordings."""
 
-from diffcloud.identification.hanging import HANG_FIELDS, find_hanging, prepared
+from diffcloud.identification.hanging import HANG_FIELDS, prepared
 from diffcloud.identification.protocol import (
     fit_settings,
     found_cloth,
+    found_layout,
     known_grip,
     with_density,
     with_material_path,
@@ -11,9 +12,9 @@ from diffcloud.identification.protocol import (
 
 __all__ = [
     "HANG_FIELDS",
-    "find_hanging",
     "fit_settings",
     "found_cloth",
+    "found_layout",
     "known_grip",
     "prepared",
     "with_density",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,10 +11,10 @@ import numpy as np
 
 from diffcloud.errors import ConfigError, EpisodeError
 from diffcloud.estimation.settings import FitSettings
-from diffcloud.identification.hanging import hanging_size, hangs
+from diffcloud.identification.hanging import find_hanging, hanging_size, hangs, prepared
 from diffcloud.io.episodes import Episode
 from diffcloud.scene.scenarios import Scenario
-from diffcloud.scene.scenarios.layout import Found, found_size, node_counts
+from diffcloud.scene.scenarios.layout import Found, Layout, find_layout, found_size, node_counts
 from diffcloud.sim.grasp import GRIP_M
 
 _DENSITY = 0.16
@@ -86,6 +87,24 @@ def found_cloth(
         "uncertain": Found(_UNCERTAIN, "priors of what is fitted too: factors of one standard deviation"),
         "steps_per_frame": Found(_STEPS, "finer steps move a lifted cloth by less than the noise"),
     }
+
+
+def found_layout(episode: Episode, cloth: Mapping[str, Any]) -> Layout:
+    """Return the scenario fields of one recording, and warnings.
+
+    Args:
+        episode: recording in metres, z up, with the track of one gripper.
+        cloth: values of the fields of `found_cloth`.
+
+    Raises:
+        EpisodeError: the recording does not show the cloth at rest, flat or hanging. The message has the reason.
+    """
+    if cloth["base"] == "hang":
+        episode, stamps = prepared(episode)
+        layout = find_hanging(episode, cloth)
+        return replace(layout, warnings=(*filter(None, [stamps]), *layout.warnings))
+    width, height = cloth["size_m"]
+    return find_layout(episode, (float(width), float(height)), 0.0 if cloth["grip"] == "pivot" else float(cloth["grip_m"]))
 
 
 def with_material_path(fields: Mapping[str, Any], folder: Path) -> dict[str, Any]:

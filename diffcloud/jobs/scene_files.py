@@ -11,7 +11,7 @@ import yaml
 
 from diffcloud.console import warn
 from diffcloud.errors import ConfigError, DiffCloudError, EpisodeError
-from diffcloud.identification import HANG_FIELDS, find_hanging, found_cloth, prepared, with_material_path
+from diffcloud.identification import HANG_FIELDS, found_cloth, found_layout, prepared, with_material_path
 from diffcloud.io.episodes import Episode, read_episode, write_episode
 from diffcloud.io.files import files_in, read_json, read_yaml, together, write_json, write_text
 from diffcloud.io.fingerprints import fingerprint
@@ -22,7 +22,7 @@ from diffcloud.jobs.preprocess import PreprocessJob
 from diffcloud.jobs.scenarios import own_scene
 from diffcloud.jobs.settings import Config
 from diffcloud.scene.scenarios.catalogue import make_scenario, own_options
-from diffcloud.scene.scenarios.layout import FIELDS, Found, find_layout
+from diffcloud.scene.scenarios.layout import FIELDS, Found
 
 _BAGS = (".bag", ".mcap", ".db3")
 _CLOTH_FIELDS = ("base", "size_m", "nodes", "material", "grip_m")
@@ -192,14 +192,13 @@ def _layouts(
     """Return the fields of each recording in recordings.yaml. Detect and write those that are missing."""
     path = out / "recordings.yaml"
     known = read_fields(path) if path.is_file() else {}
-    size, hangs = (float(cloth["size_m"][0]), float(cloth["size_m"][1])), cloth["base"] == "hang"
     blocks, layouts = [path.read_text().rstrip()] if known else [_HEAD], {}
     for name, episode in episodes.items():
         if name in known:
             if not isinstance(known[name], dict):
                 raise ConfigError(f"{path}: {name} must be a mapping of a scenario's fields, got {known[name]!r:.60}.")
             layouts[name] = dict(known[name])
-            _refuse_missing(layouts[name], HANG_FIELDS if hangs else FIELDS, f"{path}: {name}")
+            _refuse_missing(layouts[name], HANG_FIELDS if cloth["base"] == "hang" else FIELDS, f"{path}: {name}")
             where = f"{out / 'cloth.yaml'} with {name} of {path}"
             options = own_options({**cloth, **layouts[name]}, name, where, folder=out)
             try:
@@ -208,10 +207,7 @@ def _layouts(
                 raise ConfigError(f"{where}: {error}") from error
             continue
         try:
-            if hangs:
-                layout = find_hanging(episode, cloth)
-            else:
-                layout = find_layout(episode, size, 0.0 if cloth["grip"] == "pivot" else cloth["grip_m"])
+            layout = found_layout(episode, cloth)
         except EpisodeError as error:
             raise EpisodeError(f"{sources[name]}: {error}") from error
         for message in layout.warnings:

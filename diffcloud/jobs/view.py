@@ -9,14 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from diffcloud.errors import DiffCloudError, EpisodeError
-from diffcloud.identification import found_cloth
+from diffcloud.identification import found_cloth, found_layout
 from diffcloud.io.clouds import FORMATS
 from diffcloud.io.episodes import Episode
 from diffcloud.io.files import files_in
 from diffcloud.io.imports import cloud_folder
 from diffcloud.scene.scenarios import Scenario
 from diffcloud.scene.scenarios.catalogue import make_scenario, own_options
-from diffcloud.scene.scenarios.layout import find_layout
 
 _RATE_HZ = 10.0
 """Frame rate of a folder of clouds that states no times."""
@@ -62,9 +61,9 @@ def proposed_scene(episode: Episode, name: str) -> tuple[Scenario | None, list[s
     try:
         cloth: dict[str, Any] = {key: one.value for key, one in found_cloth([episode]).items()}
         size = (cloth["size_m"][0], cloth["size_m"][1])
-        layout = find_layout(episode, size, cloth["grip_m"])
+        layout = found_layout(episode, cloth)
         fields: dict[str, Any] = cloth | {key: one.value for key, one in layout.fields.items()}
-        table = fields["table_height_m"]
+        table = fields.get("table_height_m")
         scenario = make_scenario(own_options(fields, name, f"scene of {name}", folder=Path()))
         problems += [f"{text[0].upper()}{text[1:]}." for text in layout.warnings]
     except DiffCloudError as error:

@@ -8,10 +8,11 @@ import pytest
 import torch
 
 from diffcloud.errors import EpisodeError, SceneError
-from diffcloud.identification import find_hanging, found_cloth, prepared
+from diffcloud.identification import found_cloth, found_layout, prepared
 from diffcloud.identification.hanging import hanging_size, hangs
 from diffcloud.io.episodes import Episode
 from diffcloud.io.stamps import corrected_stamps, stamp_lags
+from diffcloud.jobs.view import proposed_scene
 from diffcloud.scene.scenarios import built_in
 from diffcloud.scene.scenarios.hang import HangScenario, hang_scenario
 from diffcloud.sim.motion import Keyframe, Motion
@@ -103,7 +104,7 @@ class TestLayout:
         episode, sentence = prepared(recorded(truth))
         assert hangs(episode)
         assert sentence == ""  # the stamps are right
-        layout = find_hanging(episode, cloth_of(episode, (0.30, 0.24)))
+        layout = found_layout(episode, cloth_of(episode, (0.30, 0.24)))
         found = {name: one.value for name, one in layout.fields.items()}
         assert found["held"] in (held, truth.held)
         if held != "corner":
@@ -119,13 +120,19 @@ class TestLayout:
         with pytest.raises(
             EpisodeError, match=r"hangs at rest. RMS distances: .*mm; .*at most 25 mm are allowed. Check --size"
         ):
-            find_hanging(episode, cloth_of(episode, (0.6, 0.5)))
+            found_layout(episode, cloth_of(episode, (0.6, 0.5)))
 
     def test_a_gripper_elsewhere_is_refused(self):
         episode = recorded(options())
         episode, _ = prepared(replace(episode, gripper=episode.gripper + np.array([0.0, 0.6, 0.0])))
         with pytest.raises(EpisodeError, match="from the gripper; at most"):
-            find_hanging(episode, cloth_of(episode, (0.30, 0.24)))
+            found_layout(episode, cloth_of(episode, (0.30, 0.24)))
+
+    def test_two_grippers_are_refused(self):
+        episode = recorded(options())
+        twice = np.repeat(episode.gripper, 2, axis=1)
+        with pytest.raises(EpisodeError, match="A hanging cloth may be held by one"):
+            found_layout(replace(episode, gripper=twice, grippers=("left", "right")), cloth_of(episode, (0.30, 0.24)))
 
     def test_a_flat_cloth_does_not_hang(self):
         cloud = np.random.default_rng(0).uniform(-0.15, 0.15, (400, 3)) * [1, 1, 0.01]
@@ -133,6 +140,14 @@ class TestLayout:
         assert not hangs(flat)
         with pytest.raises(EpisodeError, match="In some recordings the cloth hangs"):
             found_cloth([flat, recorded(options())])
+
+
+class TestView:
+    def test_the_proposed_cloth_hangs(self):
+        scenario, odd = proposed_scene(recorded(options()), "towel")
+        assert scenario is not None
+        assert np.ptp(scenario.scene.mesh.nodes[:, 2]) == pytest.approx(0.25, abs=0.02)
+        assert not [sentence for sentence in odd if "tilted" in sentence]
 
 
 class TestStamps:
