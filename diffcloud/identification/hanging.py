@@ -127,8 +127,8 @@ def find_hanging(episode: Episode, cloth: Mapping[str, Any]) -> Layout:
     assert episode.gripper is not None
     if len(episode.grippers) > 1:
         raise EpisodeError(
-            f"The recording has the grippers {', '.join(episode.grippers)}. A hanging cloth may be held by one. If only one "
-            "holds the cloth, leave the other tracks out."
+            f"The recording has the grippers {', '.join(episode.grippers)}. A hanging cloth may be held by one. If only "
+            "one holds the cloth, leave the other tracks out."
         )
     cloud, gripper = _first_cloud(episode), episode.gripper[:, 0]
     interval = float(np.median(np.diff(episode.times))) if episode.frame_count > 1 else 0.1
