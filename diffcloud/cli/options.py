@@ -59,7 +59,7 @@ ParamsFile = Annotated[
 ]
 StageParams = Annotated[Path | None, typer.Option("--params", help="YAML with a section for each stage.")]
 SCENE_HELP = (
-    "YAML or ARCSim JSON file, or lift, fold, band_stretch, vest_hang, shake, recorded_lift, recorded_fold, or "
+    "YAML or ARCSim JSON file, or lift, fold, band_stretch, vest_hang, shake, hang, recorded_lift, recorded_fold, or "
     "release_lift=FILE.json (release_fold, release_hang, release_band)."
 )
 SceneName = Annotated[str | None, typer.Option("--scene", help=SCENE_HELP)]

@@ -364,6 +364,26 @@ class Episode:
             sigma=None if self.sigma is None else self.sigma[chosen],
         )
 
+    def select_frames(self, kept: NDArray[np.int64]) -> Episode:
+        """Return the episode with some of its frames.
+
+        Args:
+            kept: indices of the frames, ascending.
+        """
+        counts = np.diff(self.offsets)
+        points = np.isin(np.repeat(np.arange(self.frame_count), counts), kept)
+        return replace(
+            self,
+            points=self.points[points],
+            offsets=np.cumsum([0, *counts[kept]], dtype=np.int64),
+            times=self.times[kept],
+            gripper=None if self.gripper is None else self.gripper[kept],
+            camera=None if self.camera is None else self.camera[points],
+            pixel=None if self.pixel is None else self.pixel[points],
+            sigma=None if self.sigma is None else self.sigma[points],
+            lost=None if self.lost is None else self.lost[kept],
+        )
+
     @staticmethod
     def from_frames(
         frames: Sequence[NDArray[np.floating[Any]]],

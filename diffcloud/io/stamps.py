@@ -76,20 +76,8 @@ def corrected_stamps(episode: Episode) -> tuple[Episode, Lags | None]:
     taken = episode.times - found.seconds
     kept = np.flatnonzero((taken >= episode.times[0]) & (np.maximum.accumulate(taken) == taken))
     kept = kept[np.diff(taken[kept], prepend=-np.inf) > 1e-3]
-    every = CubicSpline(episode.times, episode.gripper)
-    frames = [episode.frame(int(frame)) for frame in kept]
-    points = np.isin(np.repeat(np.arange(episode.frame_count), np.diff(episode.offsets)), kept)
-    chosen = replace(
-        episode,
-        points=episode.points[points],
-        offsets=np.cumsum([0, *map(len, frames)], dtype=np.int64),
-        times=taken[kept] - taken[kept[0]],
-        gripper=np.asarray(every(taken[kept])),
-        camera=None if episode.camera is None else episode.camera[points],
-        pixel=None if episode.pixel is None else episode.pixel[points],
-        sigma=None if episode.sigma is None else episode.sigma[points],
-        lost=None if episode.lost is None else episode.lost[kept],
-    )
+    gripper = np.asarray(CubicSpline(episode.times, episode.gripper)(taken[kept]))
+    chosen = replace(episode.select_frames(kept), times=taken[kept] - taken[kept[0]], gripper=gripper)
     return chosen, found
 
 

@@ -9,6 +9,7 @@ import pickle
 import subprocess
 import sys
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -379,6 +380,17 @@ LOST = np.zeros((4, 1, 1), np.uint8)
 
 
 class TestEpisodes:
+    def test_some_frames_are_those_frames(self):
+        rng = np.random.default_rng(0)
+        clouds = [rng.normal(size=(count, 3)).astype(np.float32) for count in (3, 1, 4, 2)]
+        track = rng.normal(size=(4, 1, 3))
+        whole = replace(Episode.from_frames(clouds, np.arange(4.0), gripper=track), camera=np.arange(10, dtype=np.uint8))
+        some = whole.select_frames(np.array([0, 2]))
+        assert [some.frame(index).tolist() for index in (0, 1)] == [clouds[0].tolist(), clouds[2].tolist()]
+        assert some.times.tolist() == [0.0, 2.0]
+        assert some.camera.tolist() == [0, 1, 2, 4, 5, 6, 7]
+        np.testing.assert_array_equal(some.gripper, track[[0, 2]])
+
     def test_lost_pixels_come_back(self, tmp_path):
         lost = np.random.default_rng(0).random((4, 2, 4)) < 0.5
         made = episode(lost=np.packbits(lost[:, None].reshape(4, 1, 8), axis=-1), meta={"pinholes": {"side": PINHOLE}})
