@@ -21,7 +21,7 @@ from diffcloud.estimation.objective import Objective
 from diffcloud.estimation.parameters import FitSpace
 from diffcloud.estimation.settings import SMOOTHING
 from diffcloud.estimation.solvers import AdamSettings, fit_adam
-from diffcloud.evaluation.markdown import markdown_table
+from diffcloud.evaluation.markdown import markdown_table, result_page
 from diffcloud.io.files import files_in, write_bytes, write_text
 from diffcloud.io.imports import release_episodes
 from diffcloud.jobs.scenarios import choose_scenario
@@ -49,6 +49,9 @@ SCENES = {
     "release_hang": "cloth_hang/demo2.json",
 }
 CONTACT_FIGURE = "contact-cost.png"
+_COMMAND = "make acceptance RELEASE=DIR REFERENCE=DIR"
+_SAME, _CLOSE = 1e-7, 1e-5
+"""Distances from the reference that count as equal after one step, and over a whole motion [release units]."""
 _NOISE = 0.02
 """Two losses closer than this part of each other count as equal: the sampling noise."""
 
@@ -166,33 +169,38 @@ def _fit_report(fits: list[_Fit], starts: int) -> str:
         for fit in fits
     ]
     best = np.array([min(fit.predictions.values()) for fit in fits])
-    single, many = np.array([fit.single for fit in fits]), np.array([fit.many for fit in fits])
-    start = np.array([fit.start for fit in fits])
-    lines = [
-        "# Fits of the published real clouds",
-        "",
-        "One-sided Chamfer loss in squared release units, 3,500 points, paper's frames and settings (50 Adam iterations, "
-        "learning rate 0.2, bounds [0.1, 10], start at the middle). The first start averages its gradient over eight "
-        f"perturbed copies (`smoothing: {SMOOTHING}`, its default). The last columns are the losses of the "
-        "published predictions, clipped to the bounds, under the same simulator, metric and points.",
-        "",
-        *markdown_table(head, rows),
-        "",
-        f"- below the start: {int((single < start).sum())} of {len(fits)}",
-        f"- one start at or below every published prediction: {int((single <= best).sum())} of {len(fits)}; within "
-        f"{100 * _NOISE:.0f} %: {int((single <= best * (1 + _NOISE)).sum())}",
-        f"- {starts} starts at or below every published prediction within {100 * _NOISE:.0f} %: "
-        f"{int((many <= best * (1 + _NOISE)).sum())} of {len(fits)}",
-    ]
+    start, single, many = np.array([(fit.start, fit.single, fit.many) for fit in fits]).T
+    means: dict[str, list[float]] = {}
     for kind in ("lift", "fold"):
         chosen = [index for index, fit in enumerate(fits) if fit.episode.startswith(kind)]
         if chosen:
-            models_mean = min(np.mean([fits[i].predictions[model] for i in chosen]) for model in models)
-            lines.append(
-                f"- {kind} means: start {start[chosen].mean():.5f}, one start {single[chosen].mean():.5f}, {starts} starts "
-                f"{many[chosen].mean():.5f}, best single predictor {models_mean:.5f}"
-            )
-    return "\n".join(lines) + "\n"
+            predictor = min(np.mean([fits[i].predictions[model] for i in chosen]) for model in models)
+            means[kind] = [len(chosen), *(float(of[chosen].mean()) for of in (start, single, many)), float(predictor)]
+    ends = " and ".join(f"{mean[3]:.5f} ({kind}s)" for kind, mean in means.items())
+    predicted = " and ".join(f"{mean[4]:.5f}" for mean in means.values())
+    return result_page(
+        "Does the paper's optimiser fit the published real clouds?",
+        f"The best of {starts} Adam starts has a mean loss of {ends}, the best published predictor {predicted}. Its loss "
+        f"is at or below every published prediction, within {100 * _NOISE:.0f} %, in "
+        f"{(many <= best * (1 + _NOISE)).sum()} of {len(fits)} recordings.",
+        markdown_table(
+            ["motion", "recordings", "mean loss at the start", "one start", f"{starts} starts", "best predictor"],
+            [[kind, f"{mean[0]:.0f}", *(f"{loss:.5f}" for loss in mean[1:])] for kind, mean in means.items()],
+        ),
+        note="The loss is the one-sided Chamfer distance of the paper, in squared release units. One start ends below its "
+        f"start in {(single < start).sum()} of {len(fits)} recordings. It ends at or below every published prediction in "
+        f"{(single <= best).sum()}, within {100 * _NOISE:.0f} % in {(single <= best * (1 + _NOISE)).sum()}.",
+        command=_COMMAND,
+        details={
+            "Each recording": [
+                "3,500 points, the paper's frames and settings: 50 Adam iterations, learning rate 0.2, bounds [0.1, 10], "
+                "start at the middle. The first start averages its gradient over eight perturbed copies (`smoothing: "
+                f"{SMOOTHING}`, its default). The last columns are losses of the published predictions, clipped to the "
+                "bounds, with the same simulator, measure and points.",
+                markdown_table(head, rows),
+            ]
+        },
+    )
 
 
 def _simulated_clouds(release: Path) -> str:
@@ -225,20 +233,20 @@ def _simulated_clouds(release: Path) -> str:
         pair = [f"{truth[key]:.2f}" for key in ("stretching", "density")]
         rows.append([f"{kind} {label}", *pair, f"{losses[0]:.1e}", f"{loss:.1e}", f"{max(losses):.1e}"])
     head = ["episode", "stretching", "density", "start", "loss frame", "worst frame"]
-    note = (
-        "One-sided Chamfer (squared release units) from the cloth simulated at the true parameters to the published "
-        "simulated clouds. At the start both are the same cloth, so that column is what sampling alone costs."
+    return result_page(
+        "Does the simulator reproduce the published simulated clouds?",
+        f"At the true parameters, the loss is at most the paper's threshold of {PAPER_THRESHOLD:g} in {at_loss} of "
+        f"{len(rows)} recordings at the frame of the loss, and in {always} of {len(rows)} in all frames.",
+        markdown_table(head, rows),
+        note="The loss is the one-sided Chamfer distance from the simulated cloth to the published clouds, in squared "
+        "release units. At the start both are the same cloth, so the column *start* is due to sampling alone.",
+        command=_COMMAND,
     )
-    counts = [
-        f"- at most {PAPER_THRESHOLD:g} at the loss frame: {at_loss} of {len(rows)}",
-        f"- on every frame: {always} of {len(rows)}",
-    ]
-    return "\n".join(["# Published simulated clouds", "", note, "", *markdown_table(head, rows), "", *counts, ""])
 
 
 def _simulated_fits(release: Path) -> str:
     """Fits of the published simulated episodes with the paper's settings."""
-    rows = []
+    rows, below, most = [], 0, 0
     episodes = [item for item in release_episodes(release) if "truth" in item[2].meta]
     with progress_bar("simulated fits", len(episodes)) as update:
         for index, (name, label, episode) in enumerate(episodes):
@@ -248,6 +256,8 @@ def _simulated_fits(release: Path) -> str:
             settings = AdamSettings(learning_rate=scenario.learning_rate, threshold=scenario.threshold)
             found = fit_adam(Objective(scenario, episode, paper=True), space, settings).uninterrupted()
             truth = episode.meta["truth"]
+            below += found.loss <= PAPER_THRESHOLD
+            most = max(most, found.iterations)
             rows.append(
                 [
                     f"{name.removeprefix('release_')} {label}",
@@ -259,15 +269,19 @@ def _simulated_fits(release: Path) -> str:
                 ]
             )
     head = ["episode", "start", "loss", "iterations", "s", "stretching (true)", "density (true)"]
-    note = (
-        f"One Adam start from the middle of the bounds with the paper's settings, stopped below {PAPER_THRESHOLD:g}. A "
-        "loss below the threshold is no identification: stretching and density trade off against each other."
+    return result_page(
+        "Does the paper's optimiser fit the published simulated clouds?",
+        f"One Adam start ends below the paper's threshold of {PAPER_THRESHOLD:g} in {below} of {len(rows)} recordings, "
+        f"after {most} iterations at most.",
+        markdown_table(head, rows),
+        note="The start is the middle of the bounds, with the paper's settings. A loss below the threshold does not "
+        "identify the parameters: stretching and density trade off against each other.",
+        command=_COMMAND,
     )
-    return "\n".join(["# Fits of the published simulated clouds", "", note, "", *markdown_table(head, rows), ""])
 
 
 def _trajectories(release: Path, reference: Path) -> str:
-    rows = []
+    rows, first, whole = [], 0, 0
     for path in (path for path in files_in(reference, ".npz") if fnmatch(path.name, "*_s*_m*.npz")):
         name = "release_" + path.name.split("_")[0]
         scenario = load_scenario(name, _scene(release, name))  # its limits are said in the table's caption
@@ -279,7 +293,9 @@ def _trajectories(release: Path, reference: Path) -> str:
         with torch.no_grad():
             found = rollout(system, len(nodes) - 1, properties=scenario.properties(system, tensors))
         distance = np.linalg.norm(found.positions[0].numpy() - nodes, axis=-1)
-        close = distance.max(axis=1) <= 1e-5
+        close = distance.max(axis=1) <= _CLOSE
+        first += distance[1].max() <= _SAME
+        whole += close.all()
         steps = int(np.argmin(close)) - 1 if not close.all() else len(nodes) - 1
         rows.append(
             [
@@ -290,68 +306,55 @@ def _trajectories(release: Path, reference: Path) -> str:
                 f"{distance.max():.1e}",
             ]
         )
-    head = ["run", "max after step 1", "steps within 1e-5", "RMS whole episode", "max whole episode"]
-    return "\n".join(
-        [
-            "# Agreement with the reference simulator",
-            "",
-            "Node distances in release units to recorded reference runs. After contact the reference is chaotic: which of "
-            "two nearly simultaneous impacts comes first, and which of two equally near nodes is pushed, decides branches.",
-            "",
-            *markdown_table(head, rows),
-            "",
-        ]
+    head = ["run", "max after step 1", f"steps within {_CLOSE:g}", "RMS whole episode", "max whole episode"]
+    return result_page(
+        "Does the simulator reproduce the reference simulator's motions?",
+        f"After the first step, {first} of {len(rows)} motions are within {_SAME:g} of the reference. {whole} stay within "
+        f"{_CLOSE:g} in all steps.",
+        markdown_table(head, rows),
+        note="Node distances to recorded reference runs, in release units. After contact the reference is chaotic: the "
+        "order of two nearly simultaneous impacts decides which way it goes on, and so does the choice between two "
+        "equally near nodes.",
+        command=_COMMAND,
     )
 
 
 def _speed(timings: list[dict[str, Any]], matchings: list[dict[str, Any]], costs: list[dict[str, Any]]) -> str:
-    note = (
-        "Milliseconds per episode with one thread, all in one run on two cores of a server; of a batch, the time of all "
-        "divided by their number. `python -m studies bench --threads 1` times the built-in scenarios, `make acceptance` "
-        "the published scenes (`release_`) too. The last column also computes forward-mode derivatives in ten directions."
-    )
     few, some, many = (next(of["forward"] for of in timings if of["nodes"] == nodes) for nodes in (256, 1024, 4096))
-    growth = (
-        "A forward motion takes time that grows as the number of nodes to the power "
-        f"{math.log(some / few, 4):.2f} from 256 to 1,024 nodes and {math.log(many / some, 4):.2f} from there to 4,096."
+    rows = benchmark_rows(timings)
+    alone = {row[0]: row for row in rows if row[3] == "1"}
+    forward, backward, tangents = alone["lift"][-3:]
+    return result_page(
+        "How long does a motion take?",
+        f"A built-in `lift` takes {forward} ms of one core, {backward} ms with its gradient, and {tangents} ms with "
+        f"derivatives in ten directions. The published lift takes {', '.join(alone['release_lift'][-3:])} ms.",
+        markdown_table(HEAD, list(alone.values())),
+        note="Milliseconds with one thread, all in one run on two cores of a server. A forward motion takes time that "
+        f"grows as the number of nodes to the power {math.log(some / few, 4):.2f} from 256 to 1,024 nodes, and "
+        f"{math.log(many / some, 4):.2f} from there to 4,096. The picture shows the cost of contacts.",
+        picture=f"![Cost over contacts]({CONTACT_FIGURE})",
+        command=_COMMAND,
+        details={
+            "Batches": [
+                "Milliseconds per motion with one thread: the time of a batch divided by its size. `python -m studies "
+                "bench --threads 1` times the built-in scenarios alone.",
+                markdown_table(HEAD, [row for row in rows if row[3] != "1"]),
+            ],
+            "What a comparison costs": [
+                "Each simulated point finds the nearest of 3,500 recorded points. Each recorded point finds the nearest "
+                "place on the cloth of 49 nodes, exactly, in all frames of a lift. A fit compares 25 frames at 200 points "
+                "each, at several poses in a row.",
+                markdown_table(MATCHING_HEAD, matching_rows(matchings)),
+            ],
+            "What a contact costs": [
+                "One cloth with ever finer meshes falls freely without contact handling, or is dropped onto a sphere of "
+                "1,280 faces: 25 steps of 10 ms of simulated time, with gradient (`python -m studies bench --contact "
+                "--threads 1`). Contacts are the mean number of repelling pairs per step. The cost of each includes the "
+                "search for pairs, impacts and their gradients.",
+                markdown_table(CONTACT_HEAD, contact_rows(costs)),
+            ],
+        },
     )
-    matching = (
-        "Each simulated point finds the nearest of 3,500 recorded ones, and each recorded point the nearest place on the "
-        "cloth of 49 nodes, exactly, in all frames of a lift. A fit compares 25 frames at 200 points each, at several "
-        "poses in a row."
-    )
-    contact = (
-        "One cloth with ever finer meshes, once in free fall without contact handling, once dropped onto a sphere of "
-        "1,280 faces: 25 steps of 10 ms of simulated time, with gradient (`python -m studies bench --contact "
-        "--threads 1`). "
-        "Contacts: the mean number of repelling pairs per step; what each costs includes the search for pairs, impacts "
-        "and their gradients."
-    )
-    lines = [
-        "# Speed",
-        "",
-        note,
-        "",
-        *markdown_table(list(HEAD), benchmark_rows(timings)),
-        "",
-        growth,
-        "",
-        "## What a comparison costs",
-        "",
-        matching,
-        "",
-        *markdown_table(list(MATCHING_HEAD), matching_rows(matchings)),
-        "",
-        "## What a contact costs",
-        "",
-        contact,
-        "",
-        *markdown_table(list(CONTACT_HEAD), contact_rows(costs)),
-        "",
-        f"![Cost over contacts]({CONTACT_FIGURE})",
-        "",
-    ]
-    return "\n".join(lines)
 
 
 def _scene(release: Path, name: str) -> Path:

@@ -12,7 +12,7 @@ import numpy as np
 
 from diffcloud.errors import ConfigError
 from diffcloud.estimation.settings import LEVEL
-from diffcloud.evaluation.markdown import markdown_table
+from diffcloud.evaluation.markdown import Details, markdown_table, result_page
 from diffcloud.evaluation.summary import largest_sources
 from diffcloud.io.files import files_in, read_json
 
@@ -144,12 +144,12 @@ def summary(cells: Sequence[Cell]) -> list[list[str]]:
 
 
 def _together(cells: Sequence[Cell], level: float) -> list[list[str]]:
-    """Rows under `TOGETHER_HEAD`, of fits whose truths are of one kind."""
+    """Rows under `TOGETHER_HEAD`: of fits, by how their truths were made, and of networks."""
     kinds: dict[str, list[dict[str, Any]]] = {"same": [], "refined": [], "finer": []}
     for (_, known, _), count in cells:
         words = known.split()
-        if words[0] == "free" or "known" in words:  # not a network
-            kinds["same" if words[-1] in ("free", "known") else words[-1]].append(count)
+        fitted = words[0] == "free" or "known" in words
+        kinds.setdefault(("same" if words[-1] in ("free", "known") else words[-1]) if fitted else known, []).append(count)
     rows = []
     for kind, counts in kinds.items():
         if counts:
@@ -246,59 +246,48 @@ def coverage_page(counts: Counts) -> str:
         raise ConfigError(f"A page is of records of one level of intervals, got {', '.join(map(str, levels)) or 'none'}.")
     level = f"{levels[0] * 100:g} %"
     cells = list(cells_of(counts))
-    rows, sources, refits = summary(cells), _sources(cells), list(refit_rows(counts))
-    networks = any({"free", "known"}.isdisjoint(row[1].split()) for row in rows)
-    lines = [
-        "# How often intervals hold the truth",
-        "",
-        "Cloths of drawn parameters are simulated, recorded (`lift` and `fold` by two depth cameras through "
-        f"`preprocess`, the others by their whole surface), fitted, and the {level} interval is held against the truth. "
-        "Nuisance material is off by the factors that fits state (`estimation.uncertain`); cameras and clock "
-        "are off by what they assume of a calibrated set-up (2 mm and 0.3° along and about each axis, and 2 ms, as "
-        "standard deviations; `preprocess` measures the clock anew), and the cloth is displaced by about a centimetre. "
-        "Errors and half-widths are of the natural logarithm: 0.1 is about 10 %. A fit that fails or states no "
-        "interval is a miss. *Identified*: of the recordings with that status, how many are within its factor of the "
-        "truth. *Refined*: the truth has four times the steps that fits take, and was recorded with noise that they do not "
-        "expect (`lift` and `fold` by worse cameras, the others with noise of 1 mm along each axis). *Finer*: like that, "
-        "and its mesh has half the edge length. "
-        + "Rows named after a network are its predictions of the same recordings (`--checkpoint`); the prior of a "
-        "posterior is the distribution that its training draws had, which may be wider than that of these truths. "
-        * networks
-        + "Command: `make coverage-own`.",
-        "",
-        *markdown_table(HEAD, rows),
-        "",
-    ]
-    if together := _together(cells, levels[0]):
-        usual = int(np.median([count["n"] for _, count in cells]))
-        least, most = _band(usual, levels[0])
-        lines += [
-            f"All rows of fits together. If each interval held the truth with a probability of exactly {level}, 99 of 100 "
-            f"rows would be in the band, which depends on the row's recordings: {least:.0f} to {most:.0f} of {usual}.",
-            "",
-            *markdown_table(TOGETHER_HEAD, together),
-            "",
-        ]
-    if sources:
-        lines += [
-            "Where the uncertainty comes from: each source's share of the variance, from its median standard deviation "
-            "over the recordings. At most the four largest are listed, and none of 1 % or less; "
-            "[evaluation.md](../evaluation.md#what-is-identified) explains each. The fourth column counts the intervals "
-            "that would still hold the truth if they counted the source `noise` alone.",
-            "",
-            *markdown_table(SOURCE_HEAD, sources),
-            "",
-        ]
-    if refits:
-        lines += [
-            "Fresh recordings of the same cloths, everything else drawn anew. A parameter is *held* where at least "
-            f"{level} of the recordings (the level of the intervals) find it within the status's factor of the truth; the "
-            "last two columns count recordings with the status *identified*.",
-            "",
-            *markdown_table(REFIT_HEAD, refits),
-            "",
-        ]
-    return "\n".join(lines)
+    together, sources, refits = _together(cells, levels[0]), _sources(cells), list(refit_rows(counts))
+    networks = [row for row in together if row[0] not in ("same", "refined", "finer")]
+    usual = int(np.median([count["n"] for _, count in cells] or [0]))
+    least, most = _band(usual, levels[0])
+    details: Details = {
+        "Each parameter": [
+            "Stretching and density are drawn at random; `lift` and `fold` are recorded by two depth cameras and "
+            "preprocessed, the others by their whole surface. Nuisance material is off by the factors that fits state "
+            "(`estimation.uncertain`). Cameras and clock are off by what fits assume of a calibrated set-up: 2 mm and 0.3° "
+            "along and about each axis, and 2 ms, as standard deviations. The cloth is displaced by about a centimetre.",
+            "Errors and half-widths are of the natural logarithm: 0.1 is about 10 %. *Identified*: of the recordings with "
+            "that status, how many are within its factor of the true value. A fit without an interval counts as a miss."
+            + " The prior of a posterior is the distribution of its training set, which may be wider than that of these "
+            "cloths." * bool(networks),
+            markdown_table(HEAD, summary(cells)),
+        ],
+        "Where the uncertainty comes from": [
+            "Each source's share of the variance, from its median standard deviation over the recordings: the four largest "
+            "above 1 %. [evaluation.md](../evaluation.md#what-is-identified) explains each. The fourth column counts the "
+            "intervals that would still contain the true value with the source `noise` alone.",
+            markdown_table(SOURCE_HEAD, sources),
+        ],
+        "Fresh recordings of the same cloths": [
+            "All but the cloth is drawn anew. A parameter is *held* where at least "
+            f"{level} of the recordings find it within the status's factor of the true value. The last two columns count "
+            "recordings with the status *identified*.",
+            markdown_table(REFIT_HEAD, refits),
+        ],
+    }
+    found = [f"{row[3]} of {row[2]} cases ({row[0]})" for row in together]
+    found += [f"{row[4]} of {row[3]} cloths in fresh recordings ({row[1]}, {row[2]})" for row in refits if not together]
+    return result_page(
+        f"How often do {level} intervals{' of fits and networks' * bool(networks)} contain the true value?",
+        f"In {', '.join(found)}.",
+        markdown_table(TOGETHER_HEAD, together) or markdown_table(REFIT_HEAD, refits),
+        note="Cloths are simulated, recorded with errors, and fitted. *Same* truths have the steps and the mesh of the "
+        "fits, *refined* ones four times the steps and other noise, *finer* ones also half the edge length."
+        + f" If each interval contained the true value with a probability of exactly {level}, 99 of 100 rows would be in the "
+        f"band: {least:.0f} to {most:.0f} of {usual} recordings." * bool(together),
+        command="make coverage-own",
+        details={name: blocks for name, blocks in details.items() if blocks[-1]},
+    )
 
 
 def _share(part: int, whole: int) -> str:

@@ -83,6 +83,7 @@ def published(
         fits=data / "fits",
         out=out,
         markdown=markdown,
+        command="make comparison RELEASE=DIR",
         as_json=json,
         references=references,
     )

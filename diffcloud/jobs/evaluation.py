@@ -13,7 +13,7 @@ from rich.table import Table
 from diffcloud.console import errors, show
 from diffcloud.errors import ConfigError
 from diffcloud.estimation.record import read_fit
-from diffcloud.evaluation.markdown import comparison_page
+from diffcloud.evaluation.page import comparison_page
 from diffcloud.evaluation.summary import PREDICTORS, headline, label, sentences, tables
 from diffcloud.evaluation.summary import metrics as summary_metrics
 from diffcloud.io.files import claimed, files_in, together, write_json, write_text
@@ -68,7 +68,15 @@ def evaluate(
     ]
     with claimed(out):
         comparison = compare(jobs, workers, scheduler)
-        metrics = write_evaluation(config, comparison, fits=fits, out=out, markdown=markdown, as_json=as_json)
+        metrics = write_evaluation(
+            config,
+            comparison,
+            fits=fits,
+            out=out,
+            markdown=markdown,
+            command="python -m pipeline.evaluate",
+            as_json=as_json,
+        )
     return metrics, comparison
 
 
@@ -79,6 +87,7 @@ def write_evaluation(
     fits: Path,
     out: Path,
     markdown: Path | None,
+    command: str,
     as_json: bool,
     references: Mapping[tuple[str, str], float] | None = None,
 ) -> dict[str, Any]:
@@ -87,6 +96,7 @@ def write_evaluation(
     Args:
         fits: folder with <scenario>/<episode>.json.
         markdown: path of a page with the tables, if wanted.
+        command: what the page names as its source.
         references: see `summary.method_table`.
     """
     curves, residuals = _curves(config, fits)
@@ -106,7 +116,7 @@ def write_evaluation(
         write_json(out / "tables" / "comparison.json", whole)
         write_tables(out, {"seconds": told["seconds"]})  # not in tables/, because wall times differ between runs
         if markdown is not None:
-            write_text(markdown, comparison_page(told, comparison.missing, config.report.title))
+            write_text(markdown, comparison_page(told, comparison.missing, config.report.title, command))
         write_json(out / "metrics.json", headline(told))
     for table in printed(told):
         show(table, as_json)

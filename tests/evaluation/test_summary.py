@@ -7,7 +7,7 @@ import math
 import pandas as pd
 import pytest
 
-from diffcloud.evaluation.markdown import comparison_page
+from diffcloud.evaluation.page import comparison_page
 from diffcloud.evaluation.repeats import consistency, other_repeats, parameter_table, repeatability, transfer
 from diffcloud.evaluation.summary import (
     against_predictors,
@@ -21,6 +21,7 @@ from diffcloud.evaluation.summary import (
     tables,
 )
 from diffcloud.io.fingerprints import fingerprint
+from tests.docs.form import check_form
 from tests.evaluation.records import record, records
 
 
@@ -182,17 +183,23 @@ class TestWords:
         assert (row["first"], row["second"], row["status_stretching"]) == ("DiffCloud", "MLP", "ratio only (2/2)")
 
     def test_markdown_has_every_table_and_what_is_missing(self, told):
-        page = comparison_page(told, ["lift/tan1: meteornet: no checkpoint"], "Tea towels")
-        assert page.startswith("# Tea towels\n")
+        page = comparison_page(told, ["lift/tan1: meteornet: no checkpoint"], "Tea towels", "make towels")
+        assert page.startswith(
+            "# Tea towels: which method has the lowest loss?\n\nDiffCloud has the lowest mean loss in lift ("
+        )
+        assert "1 expected results are missing." in page
         for heading in ("Loss per episode", "Means", "What is identified", "Transfer between repeats", "What is missing"):
-            assert f"## {heading}" in page
+            assert f"<summary>{heading}</summary>" in page
         assert "nan" not in page.lower()
+        check_form(page)
 
     def test_nothing_at_all(self):
         told = tables([record("lift", "e", methods={"diffcloud": 0.1}, stated=False)], {})
         assert sentences(told)["repeats"] == []
         assert isinstance(overview(told), pd.DataFrame)
-        assert "None." in comparison_page(told, [], "Tea towels")
+        page = comparison_page(told, [], "Tea towels", "make towels")
+        assert "What is identified" not in page
+        check_form(page)
 
 
 def test_fingerprints_tell_inputs_apart():

@@ -17,6 +17,7 @@ from studies import coverage
 from studies.coverage_page import counted, counts_of, coverage_page
 from tests.cli.invoke import study
 from tests.cli.test_commands import SMALL as LIFT
+from tests.docs.form import check_form
 from tests.regressors.test_checkpoints import regressor
 
 SMALL = {**LIFT, "recorder": "whole_surface"}
@@ -239,7 +240,7 @@ def test_refusals_and_failures_count_as_misses(tmp_path):
 
 
 def test_rows_of_one_kind_of_truth_are_counted_together(tmp_path):
-    """Of twenty recordings, 14 to 20 are in the band of 90 %; networks and refits do not count."""
+    """Of twenty recordings, 14 to 20 are in the band of 90 %; networks have rows of their own, and refits none."""
     for folder, held in {
         "free": 16,
         "density_known": 13,
@@ -258,6 +259,8 @@ def test_rows_of_one_kind_of_truth_are_counted_together(tmp_path):
     assert "| same | 2 | 40 | 29 (72 %) | 1 of 2 |" in page
     assert "| finer | 1 | 20 | 15 (75 %) | 1 of 1 |" in page
     assert "| refined |" not in page
+    assert "In 29 (72 %) of 40 cases (same), 15 (75 %) of 20 cases (finer), 0 (0 %) of 20 cases (mlp finer), 0 " in page
+    check_form(page)
 
 
 def test_refits_hold_what_nine_of_ten_find_within_the_factor(tmp_path):
@@ -308,5 +311,6 @@ def test_a_page_is_of_one_level(tmp_path):
         coverage_page(counts_of(tmp_path))
     (tmp_path / "lift" / "density_known" / "0000.json").unlink()
     page = coverage_page(counts_of(tmp_path))
-    assert "the 50 % interval is held against the truth" in page
+    assert "How often do 50 % intervals contain the true value?" in page
     assert "exactly 50 %" in page
+    check_form(page)
