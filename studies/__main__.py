@@ -15,6 +15,7 @@ COMMANDS = {
     "foreign": "studies.foreign:main",
     "gradients": "studies.gradients:gradients",
     "hanging": "studies.hanging_cloth:main",
+    "index": "studies.index:index",
     "published": "studies.published:published",
     "recorded": "studies.recorded:main",
     "recordings": "studies.recordings:recordings",

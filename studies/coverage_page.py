@@ -12,7 +12,7 @@ import numpy as np
 
 from diffcloud.errors import ConfigError
 from diffcloud.estimation.settings import LEVEL
-from diffcloud.evaluation.markdown import Details, markdown_table, result_page
+from diffcloud.evaluation.markdown import Blocks, markdown_table, result_page
 from diffcloud.evaluation.summary import largest_sources
 from diffcloud.io.files import files_in, read_json
 
@@ -250,7 +250,7 @@ def coverage_page(counts: Counts) -> str:
     networks = [row for row in together if row[0] not in ("same", "refined", "finer")]
     usual = int(np.median([count["n"] for _, count in cells] or [0]))
     least, most = _band(usual, levels[0])
-    details: Details = {
+    details: dict[str, Blocks] = {
         "Each parameter": [
             "Stretching and density are drawn at random; `lift` and `fold` are recorded by two depth cameras and "
             "preprocessed, the others by their whole surface. Nuisance material is off by the factors that fits state "
@@ -283,7 +283,8 @@ def coverage_page(counts: Counts) -> str:
         markdown_table(TOGETHER_HEAD, together) or markdown_table(REFIT_HEAD, refits),
         note="Cloths are simulated, recorded with errors, and fitted. *Same* truths have the steps and the mesh of the "
         "fits, *refined* ones four times the steps and other noise, *finer* ones also half the edge length."
-        + f" If each interval contained the true value with a probability of exactly {level}, 99 of 100 rows would be in the "
+        + f" If each interval contained the true value with a probability of exactly {level}, 99 of 100 rows would be in "
+        "the "
         f"band: {least:.0f} to {most:.0f} of {usual} recordings." * bool(together),
         command="make coverage-own",
         details={name: blocks for name, blocks in details.items() if blocks[-1]},

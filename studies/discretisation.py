@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from diffcloud.cli.options import JsonFlag
 from diffcloud.console import errors, finish, progress_bar, writes
-from diffcloud.evaluation.markdown import markdown_table
+from diffcloud.evaluation.markdown import markdown_table, result_page
 from diffcloud.io.files import write_text
 from diffcloud.jobs.scenarios import choose_scenario
 from diffcloud.scene.description import Scene
@@ -76,39 +76,36 @@ def _page(own: dict[str, Scene], steps: list[StepRow], meshes: list[MeshRow]) ->
         ]
         for row in steps
     ]
+    defaults = [row for row, of in zip(rows, steps, strict=True) if _is_default(own, of)]
     mesh_rows = [[row.scenario, row.nodes, *_millimetres(row.errors), f"{1e3 * row.seconds:.0f}"] for row in meshes]
-    lines = [
-        "# Step size and mesh",
-        "",
-        f"RMS node distance at the loss frame to the same simulation with {FINER} times the steps, over nine pairs of "
-        "stretching and density: the middles of nine equal parts of their bounds, on the logarithmic scale. The last two "
-        f"distances are to runs whose start was changed by {NUDGE:.0e} m and by {1e3 * PUSH:g} mm at random. Where the "
-        "first is large, the motion is chaotic, and no step size makes it repeat; where the second is, as in folds that "
-        "may buckle to either side, no recording repeats either. Milliseconds are processor time as far as the loss frame, "
-        "of one core. "
-        "`python -m studies discretisation` makes this page; `towel` is the tutorial's cloth with 9 × 7 nodes "
-        "([own-clouds.md](../own-clouds.md)).",
-        "",
-        *markdown_table(head, rows),
-        "",
-        *_cheapest(steps),
-    ]
-    if meshes:
-        lines += [
-            "## Meshes",
-            "",
-            "The same at the default step, between a mesh and one whose edges are halved, at the nodes of the scenario's "
-            "own mesh. A finer mesh bends where a coarse one cannot: this is a difference between models of the cloth, "
-            "which a fit of its parameters takes up in part.",
-            "",
-            *markdown_table(["scenario", "nodes", "median mm", "largest mm", "ms a motion"], mesh_rows),
-            "",
-        ]
-    return "\n".join(lines)
+    return result_page(
+        "How far are motions from those with finer steps and meshes?",
+        f"At the default steps, the largest distance to {FINER} times the steps is "
+        f"{', '.join(f'{row[4]} mm ({row[0]})' for row in defaults)}.",
+        markdown_table(head, defaults),
+        note="RMS node distances at the frame of the loss, over nine pairs of stretching and density: the middles of "
+        f"nine equal parts of their bounds, on the logarithmic scale. The start is also changed by {NUDGE:.0e} m or "
+        f"{1e3 * PUSH:g} mm at random. If the first change grows, the motion is chaotic. If the second grows, as in "
+        "folds that may buckle to either side, no recording repeats. Milliseconds are processor time of one core up to "
+        "that frame.",
+        command="python -m studies discretisation",
+        details={
+            "All steps": [markdown_table(head, rows)],
+            f"What {_BAR_MM:g} mm cost": [
+                f"Milliseconds of the cheapest steps (per frame) with which all nine pairs are within {_BAR_MM:g} mm.",
+                markdown_table(["scenario", *(_name(*stepper) for stepper in STEPPERS)], _cheapest(steps)),
+            ],
+            "Meshes": [
+                "Distances at the default step from a mesh to one with halved edges, at the nodes of the scenario's own "
+                "mesh. A finer mesh bends where a coarse one cannot. Fitted parameters absorb a part of this difference.",
+                markdown_table(["scenario", "nodes", "median mm", "largest mm", "ms a motion"], mesh_rows),
+            ],
+        },
+    )
 
 
-def _cheapest(steps: list[StepRow]) -> list[str]:
-    """Of each stepper, what holding the bar costs."""
+def _cheapest(steps: list[StepRow]) -> list[list[str]]:
+    """Of each scenario, what holding the bar costs with each stepper."""
     rows = []
     for name in dict.fromkeys(row.scenario for row in steps):
         cells = [name]
@@ -122,14 +119,7 @@ def _cheapest(steps: list[StepRow]) -> list[str]:
             best = min(holding, key=lambda row: row.seconds, default=None)
             cells.append("none" if best is None else f"{1e3 * best.seconds:.0f} ({best.steps_per_frame})")
         rows.append(cells)
-    return [
-        f"## What {_BAR_MM:g} mm cost",
-        "",
-        f"Milliseconds of the cheapest steps (a frame) with which all nine pairs are within {_BAR_MM:g} mm.",
-        "",
-        *markdown_table(["scenario", *(_name(*stepper) for stepper in STEPPERS)], rows),
-        "",
-    ]
+    return rows
 
 
 def _is_default(own: dict[str, Scene], row: StepRow) -> bool:

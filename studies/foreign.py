@@ -22,6 +22,7 @@ import sys
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import asdict, dataclass, replace
+from datetime import UTC, datetime
 from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -33,7 +34,7 @@ from numpy.typing import NDArray
 from scipy.optimize import brentq
 
 from diffcloud.errors import ConfigError
-from diffcloud.evaluation.markdown import markdown_table
+from diffcloud.evaluation.markdown import markdown_table, result_page
 from diffcloud.io.episodes import Episode, write_episode
 from diffcloud.io.files import write_npz, write_text
 from diffcloud.jobs.scene_files import find_scene
@@ -88,10 +89,14 @@ class Set:
 
 
 SETS = (
-    Set("towels", "lifted by a corner; size, place, yaw and pad told"),
+    Set("towels", "lifted by a corner; size, place, yaw and pad known"),
     Set("cut", "the same lifts, points below 5 mm above the table removed", cut=True),
     Set("one_camera", "the same lifts, seen by one camera", cameras=1),
-    Set("untold", "the same lifts; size, place and yaw not told, pad wrong by a factor of 1.5", told=False),
+    Set(
+        "untold",
+        "the same lifts; size, place and yaw unknown, the pad's size stated 1.5 times too large or too small",
+        told=False,
+    ),
     Set("folds", "folded over by a corner", kind="fold", most=10),
     Set("newton", "lifted by a corner, moved by Newton", simulator="newton", most=10),
     Set("joint", "two lifts of each towel, fitted together", motions=(0, 1), most=10),
@@ -521,26 +526,22 @@ def _page(cases: Sequence[Case], seed: int, count: int, revision: str) -> str:
         ]
         for case in cases
     ]
-    return "\n".join(
-        [
-            "# Cloths that other simulators move",
-            "",
-            f"Random cloths are moved by MuJoCo or Newton, with {COLUMNS} × {ROWS} nodes, and seen by depth "
-            f"cameras with {1e3 * _NOISE:.0f} mm of noise. `diffcloud fit` fits each recording; the density is known. "
-            "Odd seeds have wide ranges of material. *Held* counts 90 % intervals of the stretching stiffness that contain "
-            "the truth; a fit without an interval counts as not held. Half-widths are factors.",
-            "",
-            f"`python -m studies foreign --seed {seed} --count {count}`, commit {revision[:12]}.",
-            "",
-            *[f"- *{one.name}*: {one.about}." for one in SETS if any(case.set == one.name for case in cases)],
-            "",
-            *markdown_table(head, rows),
-            "",
-            "## Each fit",
-            "",
-            *markdown_table(["set", "seed", "truth, N/m", "found", "interval", "held", "status"], each),
-            "",
-        ]
+    sets = [one for one in SETS if any(case.set == one.name for case in cases)]
+    return result_page(
+        "Do intervals contain the true stiffness of cloths that other simulators move?",
+        f"90 % intervals contain it in {', '.join(f'{row[1]} ({row[0]})' for row in rows)} recordings.",
+        markdown_table(head, rows),
+        note=f"Random cloths of {COLUMNS} × {ROWS} nodes are moved by MuJoCo or Newton, without air, and seen by depth "
+        f"cameras with {1e3 * _NOISE:.0f} mm of noise. `diffcloud fit` estimates the stretching stiffness with known "
+        "density and unknown friction and bending. Odd seeds have wide ranges of material: 3 to 2,000 N/m. *Held* "
+        "counts intervals that contain the true value; a fit without an interval counts as not held. Errors are "
+        "logarithms, half-widths are "
+        "factors.\n\n" + "\n".join(f"- *{one.name}*: {one.about}." for one in sets),
+        made=f"{datetime.now(UTC).date()} at commit {revision[:12]}",
+        command=f"python -m studies foreign --sets {','.join(one.name for one in sets)} --seed {seed} --count {count}",
+        details={
+            "Each fit": [markdown_table(["set", "seed", "true N/m", "found", "interval", "held", "status"], each)],
+        },
     )
 
 

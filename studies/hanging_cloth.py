@@ -26,7 +26,7 @@ from scipy.spatial.transform import Rotation
 
 from diffcloud.clouds.surface import NO_GUESS, find_on_surface
 from diffcloud.errors import DiffCloudError, EpisodeError
-from diffcloud.evaluation.markdown import markdown_table
+from diffcloud.evaluation.markdown import markdown_table, result_page
 from diffcloud.io.arrays import read_npz
 from diffcloud.io.episodes import Episode
 from diffcloud.io.files import write_bytes, write_text
@@ -419,62 +419,44 @@ def _page(rows: Sequence[Row], swings: Mapping[str, tuple[float, float]], figure
     head = ["air", *(f"{name} mm" for name in FITTED), "others, median mm", "period s", "decay 1/s"]
     head += ["added density / density", "linear air_density / density 1/s", "air density / density 1/m"]
     heads = ["recording", *(f"{row.model} mm" for row in rows), "recorded period s", "decay 1/s"]
-    text = _TEXT.format(
-        count=len(swings),
-        others=len(swings) - len(FITTED),
-        quarter=quarter,
-        half=half,
-        three=three,
-        figure=figure,
-        side=_SIDE,
-        nodes=_NODES,
-        step=1e3 * _STEP,
-        late=1e3 * _LATE,
-        table="\n".join(markdown_table(head, table)),
-        each="\n".join(markdown_table(heads, each)),
+    alone, with_air = rows[:2]
+    return result_page(
+        "Does air move with a cloth?",
+        f"Yes: a free swing of the real cloth has a period of {half:.3f} s (median of {len(swings)}), the model without "
+        f"this air {alone.period:.3f} s and with it {with_air.period:.3f} s. The median RMS of the "
+        f"{len(swings) - len(FITTED)} predicted recordings falls from {_median(alone):.1f} to {_median(with_air):.1f} mm.",
+        markdown_table(head, table),
+        note=f"A cloth of {_SIDE:g} × {_SIDE:g} m hangs from a bar. An arm swings the bar three or four times and stops; "
+        "then the cloth swings freely. The models were fitted to three recordings. For the others, only the pose was "
+        "fitted. Millimetres are RMS distances of the recorded points from the simulated cloth, in all frames from the "
+        "first motion of the bar on. Period and decay are those of a small free swing of the model.",
+        picture=f"![The lower edge of the cloth over time]({figure})",
+        command="make hanging DATA=DIR",
+        details={
+            "Method": [
+                [
+                    f"- **Model.** {_NODES} × {_NODES} nodes and steps of {1e3 * _STEP:g} ms. The upper edge follows the "
+                    "recorded pose of the bar.",
+                    "- **Times.** Clouds are stamped when they are published, about 0.3 s late. The study takes a "
+                    "frame's time from its upper edge, which must be where the bar was. The time since the previous "
+                    "cloud predicts a part of the delay. Where the bar stands still, this prediction decides alone.",
+                    "- **Pose.** Each recording has a shift, a rotation and one lag of all frames (prior "
+                    f"{1e3 * _LATE:g} ms).",
+                    "- **Fit.** Gauss–Newton with the simulator's own derivatives. Bending and damping are nuisance "
+                    "parameters. The density of the cloth is unknown, so only ratios to it are found.",
+                    "- **Added density.** In the second row, the period of the free swing in the three recordings "
+                    "determines the added density, and their clouds determine the rest. In the third row, the clouds "
+                    "determine both.",
+                ],
+                "`studies/hanging_cloth.py` describes the recordings, which are not part of this repository.",
+            ],
+            "Each recording": [
+                markdown_table(heads, each),
+                f"Quartiles of the recorded periods: {quarter:.3f} and {three:.3f} s. A free swing lasts 1 to 2.5 s and "
+                "loses most of its amplitude in this time. A single period is known to about 0.05 s.",
+            ],
+        },
     )
-    return text.lstrip()
-
-
-_TEXT = """
-# A cloth that hangs and swings
-
-Air moves with a real cloth. A model without this air swings too fast, and neither stiffness nor air_density changes that.
-
-The recorded free swing has a period of {half:.3f} s (median of {count}; quartiles {quarter:.3f} and {three:.3f}). The
-models were fitted to three recordings. For the other {others}, only the pose was fitted.
-
-{table}
-
-![The lower edge of the cloth over time]({figure})
-
-Millimetres are the RMS distance of the recorded points from the simulated cloth, in all frames from the first motion
-of the bar on. Period and decay are those of a small free swing of the model.
-
-## What was done
-
-A cloth of {side:g} × {side:g} m hangs from a bar. An arm swings the bar three or four times and stops. Then the cloth
-swings freely. The model has {nodes} × {nodes} nodes and steps of {step:g} ms. Its upper edge follows the recorded
-pose of the bar.
-
-- **Times.** Clouds are stamped when they are published, about 0.3 s late. The study takes a frame's time from its
-  upper edge, which must be where the bar was. The time since the previous cloud predicts a part of the delay. Where
-  the bar stands still, this prediction decides alone.
-- **Pose.** Each recording has a shift, a rotation and one lag of all frames (prior {late:g} ms).
-- **Fit.** Gauss–Newton with the simulator's own derivatives. Bending and damping are fitted as nuisance parameters.
-  The density of the cloth is unknown, so only ratios to it are found.
-- **Added density.** In the second row, the period of the free swing in the three recordings determines the added density,
-  and their clouds determine the rest. In the third row, the clouds determine the added density too.
-
-## Each recording
-
-{each}
-
-A free swing lasts 1 to 2.5 s and loses most of its amplitude in this time. A single period is known to about 0.05 s.
-
-Command: `make hanging DATA=FOLDER`, with a folder of recordings as `studies/hanging_cloth.py` describes them. The
-recordings are not part of this repository.
-"""
 
 
 def _figure(recording: Recording, rows: Sequence[Row]) -> bytes:

@@ -8,7 +8,7 @@ EPISODES is what `diffcloud data import --kind release --trajectories` writes. F
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from itertools import groupby
 from pathlib import Path
 from typing import Annotated
@@ -20,7 +20,7 @@ from diffcloud.errors import ConfigError, DiffCloudError
 from diffcloud.estimation.record import FitRecord
 from diffcloud.estimation.settings import FitSettings
 from diffcloud.estimation.task import Recording
-from diffcloud.evaluation.markdown import markdown_table
+from diffcloud.evaluation.markdown import markdown_table, result_page
 from diffcloud.io.episodes import read_episode
 from diffcloud.io.files import write_text
 from diffcloud.jobs.fits import FitJob
@@ -71,49 +71,41 @@ def page(found: Mapping[str, FitRecord]) -> str:
     Args:
         found: name of a recording -> its fit.
     """
-    lifts, folds = ([one for one in found.values() if one.scenario == scenario] for scenario in SCENARIOS)
-    agreed, pairs = _repeats(found)
-    head = ["recording", "RMS, mm", "to recording, to cloth", "frames", "stretching / density", "bending", "compression"]
-    head += ["shear", "shift, cm", "yaw", "s"]
-    return "\n".join(
-        [
-            "# The published recordings, as recordings",
-            "",
-            "Default fits of the 20 real recordings that were published with the paper: two lifts and two folds of each of "
-            "five fabrics, in metres, under the recorded path of the gripper (scenarios "
-            "[`recorded_lift` and `recorded_fold`](../scenarios.md#the-published-recordings)). The import corrects one "
-            "camera against the other ([published-data.md](../published-data.md)). RMS is over both directions and the "
-            "frames up to the fit's [horizon](../solver.md#likelihood). Frames with little of the cloth above the height "
-            "where the clouds were cut off do not count. Each distance is capped at 5 cm "
-            "([the loss](../concepts.md#the-loss)).",
-            "",
-            f"Mean RMS: {_mean(lifts):.1f} mm (lifts), {_mean(folds):.1f} mm (folds).",
-            "",
-            *markdown_table(head, [_row(name, one) for name, one in found.items()]),
-            "",
-            "Stretching over density is in (N/m)/(kg/m²), bending in µN·m. Compression is the part of the stretching "
-            "stiffness that resists compression, shear the factor on the scenario's. Values at a bound of the search have "
-            "a star. Shift and yaw say how far the fit moves the scene.",
-            "",
-            "## Repeats",
-            "",
-            f"In {agreed} of {len(pairs)} pairs of repeats, such as `fold_navy` and `fold_navy2`, stretching over density "
-            f"agrees within a factor of {_AGREE}:",
-            "",
-            *markdown_table(["pair", "factor"], [[name, f"{factor:.2f}"] for name, factor in pairs]),
-            "",
-            "The residual is several times the noise of the points, and several values end at bounds. So the values "
-            "reproduce these motions, and are no properties of the fabrics: such cloth hardly stretches when it is lifted "
-            "or folded.",
-            "",
-            "`python -m studies recorded EPISODES` makes this page.",
-            "",
-        ]
+    pairs = _repeats(found)
+    rows = []
+    for scenario in SCENARIOS:
+        fits = [one for one in found.values() if one.scenario == scenario]
+        own = [factor for name, factor in pairs if found[name].scenario == scenario]
+        agree = f"{sum(factor <= _AGREE for factor in own)} of {len(own)}"
+        rows.append([scenario, str(len(fits)), f"{np.mean([one.rms_mm for one in fits]) if fits else math.nan:.1f}", agree])
+    head = ["recording", "RMS mm", "to recording, to cloth", "frames", "stretching / density", "bending", "compression"]
+    head += ["shear", "shift cm", "yaw", "s"]
+    return result_page(
+        "How close do default fits come to the published recordings?",
+        f"The mean RMS distance is {' and '.join(f'{row[2]} mm ({row[0]})' for row in rows)}. Repeats of a fabric agree on "
+        f"stretching over density within a factor of {_AGREE} in {sum(factor <= _AGREE for _, factor in pairs)} of "
+        f"{len(pairs)} pairs.",
+        markdown_table(["scene", "recordings", "mean RMS mm", f"pairs within a factor of {_AGREE}"], rows),
+        note="Two lifts and two folds of each of five fabrics are fitted in metres, under the recorded path of the gripper "
+        "([scenes](../scenarios.md#the-published-recordings)). RMS is over both directions and the frames up to the "
+        "[horizon](../solver.md#likelihood) of the fit. Each distance is capped at 5 cm ([the "
+        "loss](../concepts.md#the-loss)). Frames with little cloth above the cut of the clouds do not count. The "
+        "residual is several times the noise, and some values end at bounds. So the values reproduce these motions and "
+        "are no properties of the fabrics.",
+        command="python -m studies recorded EPISODES",
+        details={
+            "Each recording": [
+                "Stretching over density is in (N/m)/(kg/m²), bending in µN·m. Compression is the part of the stretching "
+                "stiffness that resists compression. Shear is a factor on the scene's value. A star marks a value at a "
+                "bound of the search. Shift and yaw are those of the scene.",
+                markdown_table(head, [_row(name, one) for name, one in found.items()]),
+            ],
+            "Repeats": [
+                "Larger by smaller stretching over density of two recordings, such as `fold_navy` and `fold_navy2`.",
+                markdown_table(["pair", "factor"], [[name, f"{factor:.2f}"] for name, factor in pairs]),
+            ],
+        },
     )
-
-
-def _mean(fits: Sequence[FitRecord]) -> float:
-    return float(np.mean([one.rms_mm for one in fits])) if fits else math.nan
 
 
 def _row(name: str, fit: FitRecord) -> list[str]:
@@ -145,14 +137,14 @@ def _ratio(fit: FitRecord) -> float:
     return fit.parameters["stretching"].value / fit.parameters["density"].value
 
 
-def _repeats(found: Mapping[str, FitRecord]) -> tuple[int, list[tuple[str, float]]]:
-    """How many pairs agree, and each pair's factor."""
+def _repeats(found: Mapping[str, FitRecord]) -> list[tuple[str, float]]:
+    """Name of the first recording of each pair, and the pair's factor."""
     pairs = []
     for fabric, names in groupby(sorted(found), key=lambda name: name.removesuffix("2")):
         values = [_ratio(found[name]) for name in names]
         if len(values) == 2:
             pairs.append((fabric, max(values) / min(values)))
-    return sum(factor <= _AGREE for _, factor in pairs), pairs
+    return pairs
 
 
 if __name__ == "__main__":

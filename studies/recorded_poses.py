@@ -17,7 +17,7 @@ from diffcloud.errors import ConfigError, EpisodeError
 from diffcloud.estimation.result import describe_fit
 from diffcloud.estimation.settings import FitSettings
 from diffcloud.estimation.task import Recording
-from diffcloud.evaluation.markdown import markdown_table
+from diffcloud.evaluation.markdown import markdown_table, result_page
 from diffcloud.evaluation.summary import percent
 from diffcloud.io.episodes import Episode, read_episode
 from diffcloud.io.raw_episodes import RawEpisode, read_raw_episode
@@ -34,7 +34,7 @@ from diffcloud.settings import updated
 
 POSE_HEAD = (
     "cloth at the start",
-    "nuisance",
+    "alignment",
     "recordings",
     "stretching: median error",
     "greatest",
@@ -181,25 +181,20 @@ def pose_page(rows: Sequence[Sequence[str]], recordings: Sequence[dict[str, Any]
         recorded.extrinsic_error,
         recorded.placement_error,
     )
-    lines = [
-        f"# Cameras moved {'together' if together else 'apart'}, cloth beside its place",
-        "",
-        f"Synthetic raw recordings (`make moved`). The cameras' stated places are off by {together:g} mm and {turned:g}° "
-        f"together, the second camera's by {apart:g} mm and {twisted:g}° more; cloth and gripper are shifted by {beside:g} "
-        f"mm and turned by {yaw:g}° from the stated place; the joint log is {1e3 * recorded.clock_offset_s:g} ms late. "
-        "`diffcloud data preprocess` finds the cameras' places and the lag again. Then stretching is fitted, with the "
-        "density known. The cloth starts in one of three ways: exactly as the scene says (`--initial-state none`); there, "
-        f"but with its turn fitted too (`--initial-state {_TURN}`, the default); or where the first frame of the recording "
-        "shows it, as `diffcloud fit` finds it.",
-        "",
-        f"Preprocessing had the worse camera {np.median(shifts):.1f} mm from its place in the median and "
-        f"{max(shifts):.1f} mm at most, and the log's lag within {np.median(late):.1f} ms in the median and "
-        f"{max(late):.1f} ms at most.",
-        "",
-        "*start: median mm off*, *median ° off*: RMS distance and angle between the nodes' starting positions in the "
-        "fitted pose and their true positions as seen in the clouds.",
-        "",
-        *markdown_table(POSE_HEAD, rows),
-        "",
-    ]
-    return "\n".join(lines)
+    first = rows[0]
+    best = [row for row in rows if row[0] == STARTS[1]][-1]
+    return result_page(
+        f"Do fits hold when cameras moved {'together' if together else 'apart'} and the cloth lies beside its place?",
+        f"With turn and alignment fitted, stretching is {best[3]} off in the median and {best[4]} at most, and the start "
+        f"is within 3 mm and 1° in {best[7]} recordings. With neither, stretching is {first[3]} off in the median.",
+        markdown_table(POSE_HEAD, rows),
+        note=f"The cameras' stated places are off by {together:g} mm and {turned:g}° together, the second camera's by "
+        f"{apart:g} mm and {twisted:g}° more. Cloth and gripper are shifted by {beside:g} mm and turned by {yaw:g}°. The "
+        f"joint log is {1e3 * recorded.clock_offset_s:g} ms late. `diffcloud data preprocess` refines cameras and clock: "
+        f"the worse camera ends {np.median(shifts):.1f} mm from its place in the median and {max(shifts):.1f} mm at "
+        f"most, the log within {np.median(late):.1f} ms and {max(late):.1f} ms. Then stretching is fitted with known "
+        "density.\n\nThe cloth starts as the scene says (`--initial-state none`), with its turn fitted too "
+        f"(`--initial-state {_TURN}`, the default), or as the first frame shows it. *Start*: RMS distance and angle "
+        "between the fitted starting positions of the nodes and the true ones as seen in the clouds.",
+        command="make moved",
+    )

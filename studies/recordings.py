@@ -18,6 +18,7 @@ from diffcloud.estimation.parameters import FitSpace
 from diffcloud.estimation.pose import parse_priors
 from diffcloud.estimation.settings import FitSettings
 from diffcloud.estimation.solvers import solve
+from diffcloud.evaluation.markdown import markdown_table, result_page
 from diffcloud.io.episodes import Episode, read_episode
 from diffcloud.io.files import folders_in, write_text
 from diffcloud.io.raw_episodes import RawEpisode, read_raw_episode
@@ -147,50 +148,54 @@ def _of_first_camera(episode: Episode) -> Episode:
 
 
 def _page(measured: list[tuple[str, CloudFigures, Mapping[str, Any]]], fitted: list[_Fits], config: FitSettings) -> str:
-    lines = [
-        "# Raw recordings against their truth",
-        "",
-        "Synthetic raw episodes (`python -m pipeline.synthesize`), made into clouds by `diffcloud data preprocess`, "
-        "compared with the truth that only the recorder knows. Robot and table: part of the merged clouds' points on them. "
-        "Lost: part of the visible cloth's measurements that is not in the cloud, over frames in which the cloth "
-        "moves, and in which it lies flat. Distances are RMS over a frame: mean and greatest over the frames. Command: "
-        "`make recordings`.",
-        "",
-        "| episode | points | robot % | table % | lost % | lost flat % | cloud to cloth mm | cloth to cloud mm | "
-        "camera moved mm | arm thicker mm | log late ms |",
-        "|---|---|---|---|---|---|---|---|---|---|---|",
-    ]
+    head = ["episode", "points", "robot %", "table %", "lost %", "lost flat %", "cloud to cloth mm", "cloth to cloud mm"]
+    head += ["camera moved mm", "arm thicker mm", "log late ms"]
+    rows = []
     for name, figures, quality in measured:
-        part = _parts(figures)
-        refined = quality.get("refinement")
-        shifts = "–" if refined is None else ", ".join(f"{1e3 * v:.1f}" for v in list(refined["shift_m"].values())[1:])
-        tail = "– | –" if refined is None else f"{1e3 * refined['skin_m']:.1f} | {1e3 * refined['clock_offset_s']:.0f}"
-        lines.append(
-            f"| {name} | {figures.points.min()}–{figures.points.max()} | {_percent(part['robot'], 2)} | "
-            f"{_percent(part['table'], 2)} | {_percent(part['lost'], 1)} | {_percent(part['lost_flat'], 1)} | "
-            f"{_millimetres(figures.cloud_to_cloth_m)} | {_millimetres(figures.cloth_to_cloud_m)} | {shifts} | {tail} |"
-        )
-    if fitted:
-        lines += [
-            "",
-            "## Fits",
-            "",
-            "Stretching-to-density ratio of a cloth that has been weighed (density fixed at its truth), fitted by "
-            f"{config.solver}. "
-            "The noise-free cloud is what both cameras see of the cloth, without noise, holes or masks; the gripper is "
-            "then where it truly was.",
-            "",
-            "| episode | true | noise-free | raw | raw, overhead only |",
-            "|---|---|---|---|---|",
-            *(
-                f"| {fit.episode} | {fit.true:.3f} | {_off(fit.noise_free, fit)} | {_off(fit.raw, fit)} | "
-                f"{_off(fit.overhead, fit)} |"
-                for fit in fitted
-            ),
-            "",
-            *(f"- {text}" for text in _counts(fitted)),
+        part, refined = _parts(figures), quality.get("refinement")
+        row = [
+            name,
+            f"{figures.points.min()}–{figures.points.max()}",
+            _percent(part["robot"], 2),
+            _percent(part["table"], 2),
         ]
-    return "\n".join(lines) + "\n"
+        row += [_percent(part["lost"], 1), _percent(part["lost_flat"], 1), _millimetres(figures.cloud_to_cloth_m)]
+        row += [_millimetres(figures.cloth_to_cloud_m)]
+        if refined is not None:
+            row += [", ".join(f"{1e3 * v:.1f}" for v in list(refined["shift_m"].values())[1:])]
+            row += [f"{1e3 * refined['skin_m']:.1f}", f"{1e3 * refined['clock_offset_s']:.0f}"]
+        rows.append(row + ["–"] * (len(head) - len(row)))
+    clouds = markdown_table(head, rows)
+    about = (
+        "Robot and table are parts of the points of the merged clouds. Lost is the part of the visible cloth's "
+        "measurements that is not in the cloud, over frames in which the cloth moves, and in which it lies flat. "
+        "Distances are RMS over a frame: mean and greatest over the frames."
+    )
+    off = max(1e3 * float(figures.cloud_to_cloth_m.mean()) for _, figures, _ in measured)
+    answer = f"Clouds lie within {off:.1f} mm of the cloth (RMS, mean over the frames)."
+    if fitted:
+        raw, overhead = (max(abs(_error(getattr(fit, kind), fit)) for fit in fitted) for kind in ("raw", "overhead"))
+        answer += f" Stretching over density is within {100 * raw:.0f} % of the truth, with one camera within "
+        answer += f"{100 * overhead:.0f} %."
+    return result_page(
+        "How accurate are clouds and fits of raw recordings?",
+        answer,
+        markdown_table(
+            ["episode", "true", "noise-free", "raw", "raw, overhead only"],
+            [
+                [fit.episode, f"{fit.true:.3f}", *(_off(ratio, fit) for ratio in (fit.noise_free, fit.raw, fit.overhead))]
+                for fit in fitted
+            ],
+        )
+        or clouds,
+        note=f"Synthetic raw recordings are preprocessed and fitted by `{config.solver}`, and compared with the truth. The "
+        "density of the cloth is known. A noise-free cloud is what both cameras see of the cloth, without noise, holes or "
+        f"masks. {' '.join(f'{text}.' for text in _counts(fitted))}"
+        if fitted
+        else about,
+        command="make recordings",
+        details={"Clouds": [about, clouds]} if fitted else None,
+    )
 
 
 def _parts(figures: CloudFigures) -> dict[str, float | None]:
@@ -212,21 +217,21 @@ def _millimetres(values: Any) -> str:
     return f"{1e3 * values.mean():.1f}, {1e3 * values.max():.1f}"
 
 
+def _error(ratio: float, fit: _Fits) -> float:
+    return ratio / fit.true - 1
+
+
 def _off(ratio: float, fit: _Fits) -> str:
-    return f"{ratio:.3f} ({100 * (ratio / fit.true - 1):+.0f} %)"
-
-
-def _near(ratio: float, fit: _Fits, part: float) -> bool:
-    return abs(ratio / fit.true - 1) <= part
+    return f"{ratio:.3f} ({100 * _error(ratio, fit):+.0f} %)"
 
 
 def _counts(fitted: list[_Fits]) -> list[str]:
-    known = [fit for fit in fitted if _near(fit.noise_free, fit, 0.1)]
+    known = [fit for fit in fitted if abs(_error(fit.noise_free, fit)) <= 0.1]
     return [
-        f"noise-free within 10 %: {len(known)} of {len(fitted)}",
-        f"of these, raw within 20 %: {sum(_near(fit.raw, fit, 0.2) for fit in known)} of {len(known)}",
-        f"of these, raw of the overhead camera alone within 20 %: {sum(_near(fit.overhead, fit, 0.2) for fit in known)} of "
-        f"{len(known)}",
+        f"Noise-free within 10 %: {len(known)} of {len(fitted)}",
+        f"Of these, raw within 20 %: {sum(abs(_error(fit.raw, fit)) <= 0.2 for fit in known)} of {len(known)}",
+        "Of these, raw of the overhead camera alone within 20 %: "
+        f"{sum(abs(_error(fit.overhead, fit)) <= 0.2 for fit in known)} of {len(known)}",
     ]
 
 

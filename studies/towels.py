@@ -10,7 +10,7 @@ import typer
 
 from diffcloud.cli.options import JsonFlag
 from diffcloud.console import errors, finish, progress_bar, writes
-from diffcloud.evaluation.markdown import markdown_table
+from diffcloud.evaluation.markdown import markdown_table, result_page
 from diffcloud.io.files import write_text
 from diffcloud.simulators.problem import installed
 from studies.mujoco_towels import COUNTS, OLD, PAD, Apart, compare
@@ -65,28 +65,26 @@ def _page(rows: list[Apart], seed: int, count: int) -> str:
         for row in rows
         if (row.model, row.nodes) == (PAD, _MESHES[-1])
     ]
-    finest = f"{_MESHES[-1][0]} × {_MESHES[-1][1]} nodes"
-    return "\n".join(
-        [
-            "# Towels held by a pad",
-            "",
-            f"MuJoCo lifts {count} random towels of {COUNTS[0]} × {COUNTS[1]} nodes off a table, held by a pad of 10 to 20 "
-            "mm: four nodes that keep their direction. The table shows how far this simulator's nodes are from MuJoCo's "
-            "at the true parameters, without a fit: the median over towels of the RMS over nodes, in millimetres. "
-            f"`python -m studies towels --count {count} --seed {seed}` makes this page.",
-            "",
-            *markdown_table(head, summary),
-            "",
-            "A single node is a pivot, which lets the cloth turn under it, and its compliance depends on the mesh. After "
-            "about 1.2 s the lifted cloth buckles, and the two meshes buckle into different folds.",
-            "",
-            f"## Each towel, {PAD}, {finest}",
-            "",
-            *markdown_table(
-                ["seed", "stretching N/m", "bending µN·m", "friction", *(f"{time:g} s" for time in _TIMES)], each
-            ),
-            "",
-        ]
+    finest = _MESHES[-1]
+    old, pad = (f"{_median(rows, model, finest, 1.0):.1f}" for model in (OLD, PAD))
+    return result_page(
+        "How far are lifted towels from MuJoCo's at the true parameters?",
+        f"With a pad, the nodes of {count} towels are {pad} mm from MuJoCo's after 1 s (median over towels of the RMS over "
+        f"nodes). With a single held node they are {old} mm away.",
+        markdown_table(head, summary),
+        note=f"MuJoCo lifts random towels of {COUNTS[0]} × {COUNTS[1]} nodes off a table, held by a pad of 10 to 20 mm: "
+        "four nodes that keep their direction. The table has medians in millimetres, without a fit. A single node is a "
+        "pivot, under which the cloth can turn, and its compliance depends on the mesh. After about 1.2 s the lifted "
+        "cloth buckles, and the two meshes buckle into different folds.",
+        command=f"python -m studies towels --count {count} --seed {seed}",
+        details={
+            "Each towel": [
+                f"{PAD.capitalize()}, {finest[0]} × {finest[1]} nodes.",
+                markdown_table(
+                    ["seed", "stretching N/m", "bending µN·m", "friction", *(f"{time:g} s" for time in _TIMES)], each
+                ),
+            ]
+        },
     )
 
 

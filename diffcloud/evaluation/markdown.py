@@ -6,8 +6,8 @@ import re
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 
-Details = Mapping[str, Sequence[str | Sequence[str]]]
-"""Summary line -> paragraphs, each a text or the lines of a table or list."""
+Blocks = Sequence[str | Sequence[str]]
+"""Paragraphs, each a text or the lines of a table or list."""
 
 
 def result_page(
@@ -19,7 +19,7 @@ def result_page(
     made: str = "",
     note: str = "",
     picture: str = "",
-    details: Details | None = None,
+    details: Mapping[str, Blocks] | None = None,
 ) -> str:
     """Return a page. The index of results shows its question and answer.
 
@@ -31,7 +31,7 @@ def result_page(
         made: date of the measurement, and its versions; by default today in UTC.
         note: what a reader of the table must know.
         picture: Markdown of an image.
-        details: long tables and methods, folded. The id of an entry is its summary in lower case with hyphens.
+        details: summary -> long tables and methods, folded. The id of an entry is its summary in lower case with hyphens.
     """
     source = f"Made on {made or datetime.now(UTC).date()} by `{command}`."
     parts = [f"# {question}", answer, "\n".join(table), note, picture, source]

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import pandas as pd
 
-from diffcloud.evaluation.markdown import Details, markdown_table, result_page
+from diffcloud.evaluation.markdown import Blocks, markdown_table, result_page
 from diffcloud.evaluation.methods import PHASES
 from diffcloud.evaluation.summary import Tables, against, against_predictors, label, overview, sentences
 
@@ -50,16 +50,21 @@ def comparison_page(told: Tables, missing: Sequence[str], title: str, command: s
             row.get(key) for key in ("scenario", "episodes", "first", "first_mm", "second", "second_mm", "middle_mm")
         ]
         one = predictors.get(row["scenario"])
-        compared = (f"{one['lowest']} of {one['episodes']}", against(one["below"])) if one else (None, None)
-        rows.append([*cells, *compared])
+        rows.append(
+            [*cells, f"{one['lowest']} of {one['episodes']}" if one else None, against(one["below"]) if one else None]
+        )
     where = {
         name: " and ".join(f"{row['scenario']} ({row['first_mm']:.3g} mm)" for row in best if row["first"] == name)
         for name in dict.fromkeys(row["first"] for row in best)
     }
     won = ", ".join(f"{name} in {scenarios}" for name, scenarios in where.items())
+    answer = f"{won.replace(' in ', ' has the lowest mean loss in ', 1)}."
+    if predictors:
+        compared = ", ".join(f"{one['lowest']} of {one['episodes']} ({name})" for name, one in predictors.items())
+        answer += f" Against predictors, DiffCloud is lowest in {compared} episodes."
     return result_page(
         f"{title}: which method has the lowest loss?",
-        f"{won.replace(' in ', ' has the lowest mean loss in ', 1)}.",
+        answer,
         markdown_table(head, rows),
         note="Millimetres are RMS distances from the simulated to the recorded points at the frames of the fit. Counts "
         "allow for sampling noise." + f" {len(missing)} expected results are missing." * bool(missing),
@@ -68,7 +73,7 @@ def comparison_page(told: Tables, missing: Sequence[str], title: str, command: s
     )
 
 
-def _details(told: Tables, missing: Sequence[str]) -> Details:
+def _details(told: Tables, missing: Sequence[str]) -> dict[str, Blocks]:
     """Summary -> paragraphs, of which the last is empty where there is nothing to show."""
     means = told["means"].assign(method=told["means"]["method"].map(label))
     phases = [*PHASES, "total"]

@@ -6,74 +6,68 @@ import re
 from collections import Counter, defaultdict
 from typing import Any
 
-from diffcloud.evaluation.markdown import markdown_table
+from diffcloud.evaluation.markdown import Blocks, markdown_table, result_page
 from tests.robustness.arm import STOP_WITHIN_S
 from tests.robustness.faults import DISTURBANCES
 from tests.robustness.isolated import MEGABYTES, SECONDS
 
 _LONGEST = 260
-_HEAD = """# Damaged inputs and faults
-
-`make robustness` makes a small project with the outputs of all stages, damages its files one at a time, and reads each
-with the command that takes it. It disturbs each command in the middle of its work and runs it again, and it makes things
-go wrong while an arm moves. A small fixed sample (of commands, `fit` alone) is part of the slow tests. The code is in
-`tests/robustness/`.
-
-## Damaged files
-
+_INPUTS = f"""\
 Each field of a document, each column of a table and each array is, in turn, missing, of the wrong type, NaN, infinite,
-negative, zero, huge, duplicated, or nested {levels} levels deep; and bytes are flipped or cut off at random. Each file
-is read in its own process, which may take {seconds:.0f} seconds and {gigabytes:.0f} GB. It must either succeed, or
-end with an error of this project that names file and field, and leave nothing behind. Which of the two is right is set
-for every field by `tests/robustness/expected.yaml`: it lists what may be accepted, and the rest must be refused. Flipped
-bytes may happen to give another valid file. `data check` must find a fault wherever `preprocess` refuses a raw
-episode.
-"""
-_FAULTS = """
-## Disturbed commands
-
-Every stage of the pipeline, `fit`, and `dvc repro` itself are disturbed at a random moment: by a kill, by Ctrl-C,
-by a kill of one of their worker processes, by a full disk (no file may grow beyond a random size of a hundred bytes to
-ten kilobytes), by a folder that cannot be written to, or by a second start of the same command. Afterwards, any output
-under its final name must be complete. There must be no traceback and no hang. Running the command again must give the
-same contents as an undisturbed run, and leave nothing else behind.
-"""
-_ARM = """
-## Faults while an arm moves
-
+negative, zero, huge, duplicated, or nested 100,000 levels deep. Bytes are flipped or cut off at random. Each file is
+read in its own process, which may take {SECONDS:.0f} seconds and {MEGABYTES / 1000:.0f} GB. The command must either
+succeed, or end with an error of this project that names file and field, and leave nothing behind.
+`tests/robustness/expected.yaml` lists the damages that may be accepted; all others must be refused. Flipped bytes may
+happen to give another valid file. `data check` must find a fault wherever `preprocess` refuses a raw recording."""
+_FAULTS = """\
+Every stage of the pipeline, `fit`, and `dvc repro` itself are disturbed at a random moment: by a kill, by Ctrl-C, by a
+kill of one of their worker processes, by a full disk (no file may grow beyond a random size of a hundred bytes to ten
+kilobytes), by a folder that cannot be written to, or by a second start of the same command. Afterwards, any output
+under its final name must be complete. There must be no traceback and no hang. The command is then run again. It must
+give the same contents as an undisturbed run, and leave nothing else behind."""
+_ARM = f"""\
 A capture runs with two cameras and a loopback arm that moves at 0.1 m/s and speaks the real arm's protocol. "Detected
-within" is when the fault can be noticed at the latest: at the next reading of the arm (20 ms) or the next velocity
-(100 ms), when a call to the arm is given up (400 ms; 2 s if the arm's own process does not answer), when a camera has been
-silent for its timeout (500 ms here), when its driver has not returned half a second after that, when the disk refuses or
-its queue is full (up to 1.2 s), or when the capture has been silent for the watchdog's half second. As long as the arm's
-process and its link work, Stop must reach the arm within {stop:.0f} ms of that. Otherwise the arm's own timeout for a
-silent link (500 ms) must stop it. What was recorded until then must be readable.
-"""
-_MESSAGES = """
-## Messages
-
-One message for each kind of file, as it was printed.
-"""
+within" is when the fault can be noticed at the latest: at the next reading of the arm (20 ms) or the next velocity (100
+ms); when a call to the arm is given up (400 ms; 2 s if the arm's own process does not answer); when a camera has been
+silent for its timeout (500 ms here), or its driver has not returned half a second after that; when the disk refuses or
+its queue is full (up to 1.2 s); or when the capture has been silent for the watchdog's half second. As long as the
+arm's process and its link work, Stop must reach the arm within {1000 * STOP_WITHIN_S:.0f} ms of that. Otherwise the
+arm's own timeout for a silent link (500 ms) must stop it. What was recorded until then must be readable."""
 
 
 def page(told: list[dict[str, Any]], sample: int | None) -> str:
     """Of the results of the suites, or of a sample of so many of each kind of file."""
-    inputs = [one for one in told if one["suite"] == "inputs"]
-    faults = [one for one in told if one["suite"] == "faults"]
-    arm = [one for one in told if one["suite"] == "arm"]
-    head = _HEAD.format(levels="100,000", seconds=SECONDS, gigabytes=MEGABYTES / 1000)
-    if sample is not None:
-        head += f"\nThe counts are those of a random sample, at most {sample} of each file.\n"
-    parts = [head]
+    inputs, faults, arm = ([one for one in told if one["suite"] == suite] for suite in ("inputs", "faults", "arm"))
+    named = {"damaged files": inputs, "disturbed commands": faults, "faults of a moving arm": arm}
+    counts = [(what, len(of), sum(one["wrong"] is None for one in of)) for what, of in named.items() if of]
+    details: dict[str, Blocks] = {}
     if inputs:
-        parts += _inputs(inputs)
+        messages = "One message for each kind of file, as it was printed:"
+        details["Damaged files"] = [_INPUTS, _inputs(inputs), messages, _messages(inputs)]
     if faults:
-        parts += [_FAULTS, *_faults(faults)]
+        details["Disturbed commands"] = [_FAULTS, _faults(faults)]
     if arm:
-        parts += [_ARM.format(stop=1000 * STOP_WITHIN_S), *_arm(arm)]
-    if inputs:
-        parts += [_MESSAGES, *_messages(inputs)]
-    return "\n".join(parts).rstrip() + "\n"
+        latest = max((one["late_ms"] for one in arm if one["late_ms"] is not None), default=0.0)
+        details["Faults while an arm moves"] = [
+            _ARM,
+            _arm(arm),
+            f"The latest Stop came {latest:.0f} ms after the detection.",
+        ]
+    note = (
+        "`make robustness` makes a small project with the outputs of all stages. It damages its files one at a time, "
+        "disturbs its commands and runs them again, and causes faults while an arm moves. A small fixed sample is part of "
+        "the slow tests (`tests/robustness/`)."
+    )
+    if sample is not None:
+        note += f" The counts are those of a random sample, at most {sample} of each file."
+    return result_page(
+        "Do damaged files, disturbed commands and faults of an arm end safely?",
+        f"{', '.join(f'{right} of {count} {what}' for what, count, right in counts)} ended as required.",
+        markdown_table(["what", "cases", "as required"], counts),
+        note=note,
+        command="make robustness",
+        details=details,
+    )
 
 
 def _inputs(results: list[dict[str, Any]]) -> list[str]:
@@ -124,10 +118,7 @@ def _arm(results: list[dict[str, Any]]) -> list[str]:
         within, counts = f"{1000 * one['detected_s']:.0f}", (str(one["frames"]), str(one["rows"]))
         rows.append([one["where"], one["what"], within, late, *counts, kept, _plain(one["told"])])
     heads = ["fault", "stopped by", "detected within ms", "Stop after that, ms", "frames", "rows", "as required", "message"]
-    right = sum(one["wrong"] is None for one in results)
-    latest = max((one["late_ms"] for one in results if one["late_ms"] is not None), default=0.0)
-    summary = f"{right} of {len(results)} as required; the latest Stop came {latest:.0f} ms after the detection."
-    return [*markdown_table(heads, rows), "", summary]
+    return markdown_table(heads, rows)
 
 
 def _messages(results: list[dict[str, Any]]) -> list[str]:

@@ -12,6 +12,7 @@ from typer.testing import CliRunner
 from diffcloud.errors import ConfigError
 from diffcloud.mesh.shapes import grid_cloth
 from studies import foreign as study
+from tests.docs.form import check_form
 
 CASE = study.Case("towels", 4, 40.0, True, 44.0, 35.0, 55.0, False, "identified", 20.0, "", "abc")
 
@@ -144,6 +145,8 @@ class TestCounts:
         assert "| all | 1 of 3 |" in page
         assert "| 40.0 | 44.0 | 35.0 to 55.0 | yes |" in page
         assert "no interval" in page
+        assert "at commit 0123456789ab by `python -m studies foreign --sets towels,cut --seed 4 --count 2`." in page
+        check_form(page)
 
     def test_what_is_in_the_log_is_not_fitted_again(self, tmp_path, monkeypatch):
         fitted = []

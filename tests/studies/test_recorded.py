@@ -6,6 +6,7 @@ import pytest
 
 from diffcloud.errors import ConfigError
 from studies import recorded as study
+from tests.docs.form import check_form
 from tests.estimation.records import parameter_of, record_of, recording_of
 
 
@@ -33,12 +34,15 @@ def test_the_page_has_means_rows_and_repeats():
         "fold_tan2": fit("fold_tan2", 60.0, 6.0),
     }
     page = study.page(fits)
-    assert "Mean RMS: 9.0 mm (lifts), 5.5 mm (folds)." in page
+    assert "The mean RMS distance is 9.0 mm (recorded_lift) and 5.5 mm (recorded_fold)." in page
+    assert "| recorded_lift | 2 | 9.0 | 1 of 1 |" in page
+    assert "| recorded_fold | 2 | 5.5 | 0 of 1 |" in page
     assert "| lift_tan | 8.0 | 12.0, 7.5 | 2 | 100 | 4 | 0.12 | 0.9 | 3.0 | 5.7° | 2 |" in page
     assert "| lift_tan2 | 10.0 | 12.0, 7.5 | 2 | 130* |" in page
-    assert "In 1 of 2 pairs" in page
+    assert "within a factor of 1.5 in 1 of 2 pairs" in page
     assert "| lift_tan | 1.30 |" in page
     assert "| fold_tan | 3.00 |" in page
+    check_form(page)
 
 
 def test_a_folder_without_episodes_is_refused(tmp_path):

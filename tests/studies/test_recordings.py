@@ -15,6 +15,7 @@ from diffcloud.io.episodes import read_episode, write_episode
 from diffcloud.io.images import png_size, write_depth
 from diffcloud.sensing.recorder import read_truth
 from tests.cli.invoke import invoke, stage, study
+from tests.docs.form import check_form
 
 SMALL = {
     "base": "lift",
@@ -73,7 +74,9 @@ def test_measured_against_the_truth_and_reported(work):
     figures = done.result["clouds"]["small_hidden1"]
     assert figures["robot"] <= 0.002
     assert len(done.result["fits"]) == 3
-    assert "| small_hidden1 |" in (work / "table.md").read_text(encoding="utf-8")
+    page = (work / "table.md").read_text(encoding="utf-8")
+    assert page.count("| small_hidden1 |") == 2
+    check_form(page)
     stage("fit", "--params", "params.yaml", "--out", "fits", "episodes")
     stage("evaluate", "--params", "params.yaml", "--fits", "fits", "--episodes", "episodes", "--out", "reports")
     stage(
@@ -180,6 +183,7 @@ def test_poses_found_are_held_against_the_true_ones(work, tmp_path):
     assert fits[1]["lag_ms"] is not None
     page = (tmp_path / "poses.md").read_text()
     assert "off by 0 mm and 0° together" in page
+    check_form(page)
     assert page.count("| as the first frame shows it") == page.count("| as the scenario says, its turn fitted") == 2
     broken = study("recordings", "--recorded", "recorded", "--episodes", "episodes", "--params", "params.yaml",
                     "--out", tmp_path / "poses2.md", "--nuisance", "sideways=2", code=1)  # fmt: skip
