@@ -87,6 +87,7 @@ _ON_ITS_SIDE = np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]], dtype=float)
         (recorded(turn=_ON_ITS_SIDE), SIZE, "tilted by 90 degrees"),
         (recorded(noise=0.03), SIZE, "mm thick: the cloth does not lie flat"),
         (recorded(), (0.60, 0.30), "0.600 x 0.300 m was stated"),
+        (recorded(), (SIZE[0], 1.15 * SIZE[1]), "was stated"),
         (recorded(corner=(5, 1)), SIZE, "m beside the cloth"),
         (Episode.from_frames([np.zeros((4, 3))], np.zeros(1)), SIZE, "no track of its gripper"),
     ],
@@ -101,7 +102,7 @@ def test_what_cannot_be_is_refused_before_anything_is_simulated(episode, size, m
     [
         (recorded(travel=0.01), "moves by 10 mm: such a motion shows little"),
         (recorded(points=60, noise=0.0), "fewer than 100 points"),
-        (recorded(size=(0.46, 0.33)), "off the stated size"),
+        (recorded(size=(1.07 * SIZE[0], 1.07 * SIZE[1])), "off the stated size"),
     ],
 )
 def test_what_is_odd_is_said(episode, message):

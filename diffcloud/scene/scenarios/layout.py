@@ -27,8 +27,10 @@ _FLAT_M = 0.05
 """Maximum thickness of the first cloud, for most of its points."""
 _RIM = 0.005
 """Fraction of the points that may be outside each side of the rectangle: noise and stray points."""
-_SIZE_OFF = 0.2
-"""Maximum relative difference between estimated and stated size. A larger one indicates another cloth."""
+_SIZE_OFF = 0.1
+"""Maximum relative difference between estimated and stated size. In lifts that MuJoCo moved, seen by one or two cameras or
+cut above the table, sizes were estimated within 1.2 %. With a side stated 9 % too long, the interval of the stiffness still
+held the truth; with 23 % it did not."""
 _LEVEL_M = 0.015
 """Height range around the first frame in which points may still be on the table."""
 _STRETCHED = 1.2
