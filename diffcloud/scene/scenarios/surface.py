@@ -38,12 +38,13 @@ from diffcloud.sim.grasp import GRIP_M, Grasp
 Floats = NDArray[np.float64]
 Point = tuple[Coordinate, Coordinate, Coordinate]
 
-_MOST = 500
-"""Number of nodes above which a mesh is simplified."""
+_FINER = 5 / 3
+"""Factor of the wanted number of nodes, above which a mesh is simplified."""
 _LARGEST_M = 5.0
 _THICK_M = 0.05
 """Largest thickness of a mesh that lies flat on the table."""
-_BESIDE = 0.05
+_BESIDE = (0.07, 0.03)
+"""Barycentric coordinates of a point beside a node."""
 _UNEVEN_M = 1e-3
 """Standard deviation [m] of noise on a hanging cloth before it settles. Without, it would stay in an unstable plane."""
 
@@ -64,8 +65,8 @@ class MeshScenario(ScenarioOptions):
 
     mesh: str
     """Path of the OBJ file: positions `v` [m] and faces `f`. Texture coordinates are not used."""
-    nodes: Annotated[int, Field(ge=20, le=_MOST)] = 300
-    """Number of nodes to which a mesh of more than 500 nodes is simplified."""
+    nodes: Annotated[int, Field(ge=20, le=2000)] = 300
+    """Number of nodes to which a mesh is simplified if it has more than 5/3 of them."""
     start: Literal["flat", "hang"] = "flat"
     grippers: dict[str, Hold] = Field(default_factory=dict)
     path: Keyframes = Field(default_factory=lambda: [(0.0, 0.0, 0.0, 0.0), (2.5, 0.0, 0.0, 0.3)])
@@ -133,7 +134,7 @@ def mesh_scenario(options: MeshScenario) -> Scenario:
 
 
 def read_mesh(path: Path, count: int) -> SurfaceMesh:
-    """Read a cloth's mesh. One of more than 500 nodes is simplified to about `count`.
+    """Read a cloth's mesh. One of more than 5/3 `count` nodes is simplified to about `count`.
 
     Raises:
         MeshError: the file is not readable, is not in metres, or is not one manifold part.
@@ -161,7 +162,7 @@ def _read(path: Path, changed: int, count: int) -> SurfaceMesh:
         )
     try:
         cloth_of(found)  # checks the faces
-        return simplified(found, count) if len(used) > _MOST else found
+        return simplified(found, count) if len(used) > _FINER * count else found
     except MeshError as error:
         raise MeshError(f"{path}: {error}") from error
 
@@ -220,12 +221,11 @@ def layers(nodes: Floats, faces: NDArray[np.int64]) -> NDArray[np.int64]:
         )
 
     whole = twice_area(a, b, c)
-    # a point beside each node, towards its neighbours, is under no edge, and inside the outline
-    count = np.bincount(faces.ravel(), minlength=len(nodes))[:, None]
-    beside = np.stack(
-        [np.bincount(faces.ravel(), np.repeat(axis, 3), len(nodes)) for axis in corner.mean(axis=1).T], axis=1
-    )
-    point = (nodes + _BESIDE * (beside / np.maximum(count, 1) - nodes))[None]
+    # a point beside each node, inside one of its faces: it is inside the outline, and hardly above an edge
+    order = np.argsort(faces.ravel(), kind="stable")
+    first = order[np.searchsorted(faces.ravel()[order], np.arange(len(nodes)))]
+    others = [faces[first // 3, (first % 3 + turn) % 3] for turn in (1, 2)]
+    point = (nodes + sum(share * (nodes[one] - nodes) for share, one in zip(_BESIDE, others, strict=True)))[None]
     weights = np.stack([twice_area(point, b, c), twice_area(a, point, c), twice_area(a, b, point)], -1)
     with np.errstate(divide="ignore", invalid="ignore"):
         weights = weights / whole[..., None]  # [F, V, 3]
@@ -322,7 +322,8 @@ def under_pad(surface: SurfaceMesh, point: Floats, size: float) -> tuple[Surface
             middle = target = nodes[bound[0]]
         elif len(bound):
             start, way = nodes[bound[0]], nodes[bound[1]] - nodes[bound[0]]
-            middle = target = start + way * float(np.clip((place - start) @ way / (way @ way), 0, 1))
+            middle = nodes[bound].mean(axis=0)
+            target = start + way * float(np.clip((place - start) @ way / (way @ way), 0, 1))
         else:
             middle = nodes[members].mean(axis=0)
         free = np.setdiff1d(members, np.concatenate([turning, held]))
