@@ -117,9 +117,9 @@ SETS = (
     ),
     Set("folds", "folded over by a corner", kind="fold", most=10),
     Set("newton", "lifted by a corner, moved by Newton", simulator="newton", most=10),
-    Set("shirts", "T-shirts of one layer, lifted by a shoulder; mesh, pad and track told", kind="shirt", most=2),
-    Set("vests", "vests of one layer, lifted by a strap; mesh, pad and track told", kind="vest", most=2),
-    Set("skirts", "skirts of one layer, lifted at the waist; mesh, pad and track told", kind="skirt", most=2),
+    Set("shirts", "T-shirts of one layer, lifted by a shoulder; mesh, pad and track told", kind="shirt", most=3),
+    Set("vests", "vests of one layer, lifted by a strap; mesh, pad and track told", kind="vest", most=3),
+    Set("skirts", "skirts of one layer, lifted at the waist; mesh, pad and track told", kind="skirt", most=3),
     Set("pairs", "held at two corners by two grippers; size, pad and tracks told", kind="pair", most=6),
     Set("joint", "two lifts of each towel, fitted together", motions=(0, 1), most=10),
 )

@@ -125,20 +125,22 @@ def find_hanging(episode: Episode, cloth: Mapping[str, Any]) -> Layout:
             message has all distances.
     """
     assert episode.gripper is not None
-    if len(episode.grippers) > 1:
+    if len(episode.grippers) > 2:
         raise EpisodeError(
-            f"The recording has the grippers {', '.join(episode.grippers)}. A hanging cloth may be held by one. If only "
-            "one holds the cloth, leave the other tracks out."
+            f"The recording has the grippers {', '.join(episode.grippers)}. A hanging cloth is held by one, or by two at "
+            "the corners of a side. Leave the other tracks out."
         )
-    cloud, gripper = first_cloud(episode), episode.gripper[:, 0]
+    cloud, grippers = first_cloud(episode), episode.gripper[0]
     shared = hanging_course(episode)
     base = {**cloth, **{name: one.value for name, one in shared.items()}}
     tried: list[_Hypothesis] = []
     for fields in _ways(cloud, tuple(cloth["size_m"])):
+        if len(grippers) > 1 and fields["held"] != "corners":
+            continue
         options = own_options({**base, **fields}, "hang", "the cloth", folder=Path())
         assert isinstance(options, HangScenario)
         try:
-            tried.append(_placed(options, cloud))
+            tried.append(_held_by(_placed(options, cloud), episode))
         except SceneError:  # it does not come to rest
             continue
     tried.sort(key=lambda one: one.rms_m)
@@ -152,13 +154,14 @@ def find_hanging(episode: Episode, cloth: Mapping[str, Any]) -> Layout:
     ties = [one for one in tried if one.rms_m < _TIE * tried[0].rms_m]
     best, reason = _by_motion(ties, episode) if len(ties) > 1 else (ties[0], "nearest to the first cloud")
     chosen = best.options
-    warnings = refuse_far(np.array(chosen.rim_m), gripper[0])
+    warnings = refuse_far(np.array(chosen.rim_m), grippers.mean(axis=0))
     found = {
         "held": Found(chosen.held, f"{reason}: {scores}"),
         "side": Found(chosen.side, "the held side, along the cloth's own x or y"),
         "rim_m": Found([round(x, 4) for x in chosen.rim_m], "where the settled cloth is nearest to the first cloud"),
         "yaw_deg": Found(round(chosen.yaw_deg % 360, 2), "likewise"),
         "span": Found(round(chosen.span, 3), "distance of the held corners over the length of their side"),
+        **({"grippers": Found(list(chosen.grippers), "gripper of each corner")} if len(grippers) > 1 else {}),
         **shared,
     }
     return Layout(found, tuple(warnings))
@@ -202,7 +205,7 @@ def refuse_far(held: Floats, gripper: Floats) -> list[str]:
 def first_cloud(episode: Episode) -> Floats:
     """Return points [N, 3] of the frames before the gripper moves [m]."""
     assert episode.gripper is not None
-    way = np.linalg.norm(episode.gripper[:, 0] - episode.gripper[0, 0], axis=1)
+    way = np.linalg.norm(episode.gripper - episode.gripper[0], axis=2).max(axis=1)
     still = int(np.argmax(way > _STILL_M)) if (way > _STILL_M).any() else episode.frame_count
     points = np.concatenate([episode.frame(frame) for frame in range(min(max(still, 1), _FIRST_FRAMES))])
     return points[:: max(len(points) // _FIRST_POINTS, 1)].astype(np.float64)
@@ -244,6 +247,19 @@ def _placed(options: HangScenario, cloud: Floats) -> _Hypothesis:
     x, y, z = rim.tolist()
     placed = {"rim_m": (x, y, z), "yaw_deg": (options.yaw_deg + math.degrees(turned)) % 360}
     return _Hypothesis(options.model_copy(update=placed), rms)
+
+
+def _held_by(one: _Hypothesis, episode: Episode) -> _Hypothesis:
+    """Assign each of two held corners to the gripper at its place."""
+    assert episode.gripper is not None
+    names = episode.grippers
+    if len(names) == 1:
+        return one
+    options, yaw = one.options, math.radians(one.options.yaw_deg)
+    along = options.span * options.size_m["xy".index(options.side)] * np.array([math.cos(yaw), math.sin(yaw), 0.0])
+    apart = episode.gripper[0, 1] - episode.gripper[0, 0]
+    ordered = names if float(apart @ along) > 0 else names[::-1]
+    return replace(one, options=options.model_copy(update={"grippers": ordered}))
 
 
 def aligned(nodes: Floats, faces: NDArray[np.int64], held: Floats, cloud: Floats) -> tuple[Floats, float, float]:
