@@ -1,6 +1,6 @@
 """Search for the initial state of a recorded cloth of any shape, given as a triangle mesh.
 
-On a table, the mesh is laid with either face up, in 24 directions, and aligned with the first cloud. From one gripper, it
+On a table, the mesh is placed with either face up, in 24 directions, and aligned with the first cloud. From one gripper, it
 is hung by the points of its outline that fit the height of the cloud. The hypothesis with the smallest RMS distance is
 chosen.
 """
@@ -47,7 +47,7 @@ from diffcloud.scene.scenarios.layout import (
     refuse_beside,
     refuse_table,
 )
-from diffcloud.scene.scenarios.surface import MeshScenario, laid_points, level_frame, mesh_scenario, read_mesh
+from diffcloud.scene.scenarios.surface import MeshScenario, flat_points, level_frame, mesh_scenario, read_mesh
 
 Floats = NDArray[np.float64]
 
@@ -86,10 +86,10 @@ def find_mesh(episode: Episode, cloth: Mapping[str, Any]) -> Layout:
             the distances.
         MeshError: the mesh cannot be a cloth.
     """
-    return (_hung if cloth["start"] == "hang" else _laid)(episode, cloth)
+    return (_hanging if cloth["start"] == "hang" else _flat)(episode, cloth)
 
 
-def _laid(episode: Episode, cloth: Mapping[str, Any]) -> Layout:
+def _flat(episode: Episode, cloth: Mapping[str, Any]) -> Layout:
     assert episode.gripper is not None
     surface = read_mesh(Path(cloth["mesh"]), int(cloth["nodes"]))
     frame = level_frame(surface.nodes, surface.faces)
@@ -97,7 +97,7 @@ def _laid(episode: Episode, cloth: Mapping[str, Any]) -> Layout:
     whole = flat_cloud(episode)
     height = float(np.median(whole[:, 2]))
     hands = episode.gripper[0] * [1, 1, 0]
-    flats = {up: laid_points(surface.nodes, frame, up, 0.0) * [1, 1, 0] for up in ("front", "back")}
+    flats = {up: flat_points(surface.nodes, frame, up, 0.0) * [1, 1, 0] for up in ("front", "back")}
     tried = [(0.0, up, yaw, np.median(whole, axis=0)) for up in flats for yaw in np.linspace(0, 2 * np.pi, _TURNS + 1)[1:]]
     for points, steps, kept in _STAGES:
         cloud = whole[:: max(len(whole) // points, 1)] * [1, 1, 0]
@@ -112,7 +112,7 @@ def _laid(episode: Episode, cloth: Mapping[str, Any]) -> Layout:
     centre = place[:2]
     listed = _distinct([(rms, f"{up} up, {math.degrees(yaw) % 360:.0f} degrees") for rms, up, yaw, _ in tried])
     _refuse_other(rms, listed, cloth["mesh"])
-    flat = laid_points(surface.nodes, frame, up, yaw)
+    flat = flat_points(surface.nodes, frame, up, yaw)
     refuse_table(episode, whole, (math.sqrt(covered_area(whole)),) * 2)
     extent = float(np.ptp(surface.nodes, axis=0).max())
     grippers = dict[str, Any]()
@@ -187,7 +187,7 @@ def _aligned_flat(
 
 
 def _on_mesh(point: Floats, frame: tuple[Floats, Floats], up: str, yaw: float) -> Floats:
-    """Return the coordinates [3] in the mesh file of a point about the laid mesh's origin."""
+    """Return the coordinates [3] in the mesh file of a point about the flat mesh's origin."""
     rotation, centre = frame
     cosine, sine = math.cos(yaw), math.sin(yaw)
     flat = point @ np.array([[cosine, -sine, 0], [sine, cosine, 0], [0, 0, 1]])
@@ -196,7 +196,7 @@ def _on_mesh(point: Floats, frame: tuple[Floats, Floats], up: str, yaw: float) -
     return np.asarray(flat @ rotation + centre)
 
 
-def _hung(episode: Episode, cloth: Mapping[str, Any]) -> Layout:
+def _hanging(episode: Episode, cloth: Mapping[str, Any]) -> Layout:
     assert episode.gripper is not None
     if len(episode.grippers) > 1:
         raise EpisodeError(

@@ -14,7 +14,7 @@ from diffcloud.mesh.shapes import grid_cloth
 from diffcloud.mesh.topology import SurfaceMesh
 from diffcloud.scene.scenarios.catalogue import make_scenario, own_options
 from diffcloud.scene.scenarios.layout import find_layout
-from diffcloud.scene.scenarios.surface import laid_points, level_frame
+from diffcloud.scene.scenarios.surface import flat_points, level_frame
 from diffcloud.sim.simulate import rollout
 from tests.cli.invoke import invoke
 from tests.identification.test_hanging import surface
@@ -38,7 +38,7 @@ def recorded(mesh=MESH, up="front", yaw=0.7, held=(-0.1, 0.17), hand=0.0, others
     rng = np.random.default_rng(0)
     place, points = [0.5, 0.1, 0.03], np.array([[*one, 0.0] for one in (held, *others)])
     frame = level_frame(mesh.nodes, mesh.faces)
-    nodes, grasps = (laid_points(one, frame, up, yaw) + place for one in (mesh.nodes, points))
+    nodes, grasps = (flat_points(one, frame, up, yaw) + place for one in (mesh.nodes, points))
     clouds = [surface(nodes, mesh.faces, 2500, rng) + np.array([0, 0, rise]) for rise in (0.0, 0.3)]
     clouds[0] = clouds[0][np.linalg.norm((clouds[0] - grasps[0])[:, :2], axis=1) > hand]
     names = ("a", "b")[: len(points)]
@@ -57,7 +57,7 @@ def found(episode, folder, mesh=MESH):
 def test_the_cloth_is_found_where_it_was_laid(tmp_path, up, yaw, hand):
     episode, nodes = recorded(up=up, yaw=yaw, hand=hand)
     fields, _ = found(episode, tmp_path)
-    placed = laid_points(MESH.nodes, FRAME, fields["up"], np.radians(fields["yaw_deg"])) + np.array(
+    placed = flat_points(MESH.nodes, FRAME, fields["up"], np.radians(fields["yaw_deg"])) + np.array(
         [*fields["center_m"], 0.03]
     )
     assert fields["up"] == up

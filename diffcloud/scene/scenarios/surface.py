@@ -109,7 +109,7 @@ def mesh_scenario(options: MeshScenario) -> Scenario:
             held[name] = [int(np.linalg.norm(rest.nodes - point, axis=1).argmin())]
         else:
             rest, held[name] = under_pad(rest, point, options.grip_m)
-    nodes = _hung(options, rest, held) if options.start == "hang" else _laid(options, rest)
+    nodes = _hanging(options, rest, held) if options.start == "hang" else _flat(options, rest)
     extent = 2.0 * float(np.ptp(rest.nodes, axis=0).max()) + options.reach
     table = rectangle_surface(options.center_m, (extent, extent), options.table_height_m - sunk(options, options.gap_m))
     scenario = assemble(
@@ -184,8 +184,8 @@ def level_frame(nodes: Floats, faces: NDArray[np.int64]) -> tuple[Floats, Floats
     return np.stack([x, np.cross(up, x), up]), centre
 
 
-def laid_points(points: Floats, frame: tuple[Floats, Floats], up: str, yaw: float) -> Floats:
-    """Return mesh points [N, 3] laid flat about the origin, with rotation `yaw` [rad] about the vertical."""
+def flat_points(points: Floats, frame: tuple[Floats, Floats], up: str, yaw: float) -> Floats:
+    """Return mesh points [N, 3] placed flat about the origin, with rotation `yaw` [rad] about the vertical."""
     rotation, centre = frame
     flat = (points - centre) @ rotation.T
     if up == "back":
@@ -194,9 +194,9 @@ def laid_points(points: Floats, frame: tuple[Floats, Floats], up: str, yaw: floa
     return np.asarray(flat @ np.array([[cosine, sine, 0], [-sine, cosine, 0], [0, 0, 1]]))
 
 
-def _laid(options: MeshScenario, rest: SurfaceMesh) -> Floats:
+def _flat(options: MeshScenario, rest: SurfaceMesh) -> Floats:
     """Return the nodes [V, 3] on the table, its layers above each other."""
-    flat = laid_points(rest.nodes, level_frame(rest.nodes, rest.faces), options.up, float(np.deg2rad(options.yaw_deg)))
+    flat = flat_points(rest.nodes, level_frame(rest.nodes, rest.faces), options.up, float(np.deg2rad(options.yaw_deg)))
     thick = float(np.ptp(flat[:, 2]))
     if thick > _THICK_M:
         raise SceneError(
@@ -237,7 +237,7 @@ def layers(nodes: Floats, faces: NDArray[np.int64]) -> NDArray[np.int64]:
     return np.asarray((inside & lower).sum(axis=0))
 
 
-def _hung(options: MeshScenario, rest: SurfaceMesh, held: Mapping[str, list[int]]) -> Floats:
+def _hanging(options: MeshScenario, rest: SurfaceMesh, held: Mapping[str, list[int]]) -> Floats:
     """Return the nodes [V, 3] before settling: the mesh turned such that its centre hangs below what is held."""
     places = [one.at_m for one in options.grippers.values()]
     if None in places or len(places) > 2:
