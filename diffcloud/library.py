@@ -35,15 +35,16 @@ from diffcloud.identification import (
     found_layout,
     known_grip,
     prepared,
+    starts_hanging,
     with_density,
-    with_material_path,
 )
 from diffcloud.io.episodes import Episode, read_episode
 from diffcloud.io.files import read_yaml, together, write_json, write_text
+from diffcloud.io.grippers import tracks_beside
 from diffcloud.io.imports import cloud_folder
 from diffcloud.reporting.fit_page import Status, Told, page_of, summary_of
 from diffcloud.scene.scenarios import Scenario, load_scenario
-from diffcloud.scene.scenarios.catalogue import make_scenario, own_options
+from diffcloud.scene.scenarios.catalogue import make_scenario, own_options, with_paths
 from diffcloud.sim.properties import PARAMETERS
 from diffcloud.sim.simulate import Rollout, rollout
 from diffcloud.simulators.export.cloth import fitted_cloth
@@ -94,7 +95,7 @@ class Scene:
             return Scene(str(source), {"base": str(source)})
         path = Path(source)
         load_scenario(path)  # only to check the file
-        return Scene(path.stem, with_material_path(read_yaml(path, error=ConfigError) or {}, path.parent))
+        return Scene(path.stem, with_paths(read_yaml(path, error=ConfigError) or {}, path.parent))
 
     @cached_property
     def scenario(self) -> Scenario:
@@ -205,7 +206,8 @@ def load_recording(
 
     Args:
         path: `.npz` file, or folder of `.npy`, `.ply`, `.xyz` or `.pcd` files in metres, z up.
-        grippers: for a folder: gripper name -> CSV file with columns t_s, x, y, z. Default: its gripper.csv.
+        grippers: for a folder: gripper name -> CSV file with columns t_s, x, y, z. Default: its gripper.csv, or
+            its gripper_NAME.csv for each of several.
         rate_hz: for a folder: frame rate, if neither the CSV nor the file names have times.
 
     Raises:
@@ -217,12 +219,7 @@ def load_recording(
     if not path.is_dir():
         raise EpisodeError(f"No such recording: {path}.")
     if grippers is None:
-        if not (path / "gripper.csv").is_file():
-            raise EpisodeError(
-                f"{path} holds no gripper.csv with the columns t_s, x, y, z [m], one row a frame. Name other files with "
-                "`grippers`, or make an episode of a bag by `diffcloud data import`."
-            )
-        grippers = {"gripper": path / "gripper.csv"}
+        grippers = tracks_beside(path)
     return cloud_folder(path, grippers={name: Path(file) for name, file in grippers.items()}, rate_hz=rate_hz)
 
 
@@ -230,25 +227,28 @@ def find_scenes(
     recordings: Sequence[Episode],
     *,
     size: tuple[float, float] | None = None,
+    mesh: str | Path | None = None,
     density: float | tuple[float, float] | None = None,
     grip: float | None = None,
 ) -> list[Scene]:
-    """Build a scene for each recording of a rectangular cloth, which first lies flat or hangs from the gripper.
+    """Build a scene for each recording of a cloth, which first lies flat or hangs from the gripper.
 
     Args:
-        size: side lengths [m]. Default: estimated from the first frames.
+        size: side lengths of a rectangle [m]. Default: estimated from the first frames.
+        mesh: OBJ file of a cloth of another shape, in metres, at rest in this shape.
         density: mass per area [kg/m²] of the weighed cloth, or (value, standard deviation). Default: estimated by the
             fit.
         grip: side of the gripper's pad [m]. Default: 20 mm, refined by the fit.
 
     Raises:
         EpisodeError: a recording shows something else. The message has the reason.
+        ConfigError, MeshError: size and mesh are both given, or the mesh cannot be a cloth.
     """
     weighed = None if density is None else density if isinstance(density, tuple) else (float(density), 0.0)
-    fields = found_cloth(recordings, size, None if weighed is None else weighed[0])
+    fields = found_cloth(recordings, size, None if weighed is None else weighed[0], None if mesh is None else Path(mesh))
     cloth: dict[str, Any] = {name: found.value for name, found in fields.items()}
     if grip is not None:
-        cloth |= {"grip_m": grip} if cloth["base"] == "hang" else known_grip(grip)
+        cloth |= {"grip_m": grip} if starts_hanging(cloth) else known_grip(grip)
     if weighed is not None and weighed[1]:
         cloth = with_density(cloth, *weighed)
     scenes = list[Scene]()
@@ -315,7 +315,7 @@ def fit(
 
 def _as_fitted(scene: Scene, episode: Episode) -> Episode:
     """The recording in the form in which fits of this scene take it."""
-    return prepared(episode)[0] if scene.options.get("base") == "hang" else episode
+    return prepared(episode)[0] if starts_hanging({"base": "lift", **scene.options}) else episode
 
 
 def _estimates(record: FitRecord, intervals: Intervals | None, scenario: Scenario, level: float) -> dict[str, Estimate]:

@@ -24,6 +24,7 @@ from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
 from functools import cached_property
+from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -37,9 +38,12 @@ from diffcloud.errors import ConfigError
 from diffcloud.evaluation.markdown import markdown_table, result_page
 from diffcloud.io.episodes import Episode, write_episode
 from diffcloud.io.files import write_npz, write_text
+from diffcloud.io.obj import write_surface
 from diffcloud.jobs.scene_files import find_scene
-from diffcloud.mesh.shapes import grid_cloth
-from diffcloud.mesh.topology import SurfaceMesh
+from diffcloud.mesh.refinement import refined
+from diffcloud.mesh.shapes import grid_cloth, lined_cloth
+from diffcloud.mesh.simplified import cloth_of
+from diffcloud.mesh.topology import ClothMesh, SurfaceMesh
 from diffcloud.scene.scenarios.grid import GridScenario
 from diffcloud.sensing.cameras import looking_at
 from diffcloud.sensing.recorder import caster
@@ -50,7 +54,7 @@ from diffcloud.simulators.problems import strip
 from studies.mujoco_towels import COUNTS, one_way
 
 Floats = NDArray[np.float64]
-Kind = Literal["lift", "fold"]
+Kind = Literal["lift", "fold", "pair", "shirt", "skirt", "vest"]
 Simulator = Literal["mujoco", "newton"]
 
 COLUMNS, ROWS = COUNTS
@@ -67,6 +71,20 @@ _WRONG = 1.5
 _NEWTON_STEP = 1e-4
 """[s] Longer ones make a strip too stiff."""
 _Z90 = 1.645
+_GARMENT_M = 0.021
+"""Largest edge of a garment's grid [m], about that of a towel."""
+_OUTLINES: dict[str, tuple[tuple[float, ...], tuple[float, ...]]] = {
+    "shirt": ((0.0, 0.11, 0.39, 0.5), (0.0, 0.30, 0.44)),
+    "vest": ((0.0, 0.04, 0.12, 0.24, 0.32, 0.36), (0.0, 0.24, 0.32, 0.44)),
+    "skirt": ((0.0, 0.34), (0.0, 0.32)),
+}
+"""Lines of a garment across and along, at which its outline turns [m]."""
+_ABSENT = {"shirt": {(0, 0), (2, 0)}, "vest": {(0, 1), (4, 1), (0, 2), (2, 2), (4, 2)}, "skirt": set()}
+"""Rectangles between these lines that are no cloth."""
+_SHOULDER = {"shirt": 0.37, "vest": 0.31, "skirt": 0.31}
+"""Position across of the point that is held, at the upper end [m]."""
+_TAPER = 0.3
+"""Part of its width that a skirt loses up to the waist."""
 _GAP_M: float = GridScenario.model_fields["gap_m"].default
 
 
@@ -99,13 +117,17 @@ SETS = (
     ),
     Set("folds", "folded over by a corner", kind="fold", most=10),
     Set("newton", "lifted by a corner, moved by Newton", simulator="newton", most=10),
+    Set("shirts", "T-shirts of one layer, lifted by a shoulder; mesh, pad and track told", kind="shirt", most=3),
+    Set("vests", "vests of one layer, lifted by a strap; mesh, pad and track told", kind="vest", most=3),
+    Set("skirts", "skirts of one layer, lifted at the waist; mesh, pad and track told", kind="skirt", most=3),
+    Set("pairs", "held at two corners by two grippers; size, pad and tracks told", kind="pair", most=6),
     Set("joint", "two lifts of each towel, fitted together", motions=(0, 1), most=10),
 )
 
 
 @dataclass(frozen=True)
 class Cloth:
-    """A rectangle with a random material, moved by a pad at one corner in one of its motions."""
+    """A cloth with a random material, moved by a pad, or by two, in one of its motions."""
 
     seed: int
     kind: Kind = "lift"
@@ -141,14 +163,39 @@ class Cloth:
         return float(self._own["friction"])
 
     @property
+    def garment(self) -> bool:
+        return self.kind in _OUTLINES
+
+    @property
     def size(self) -> tuple[float, float]:
-        """Along the columns and along the rows [m]."""
+        """Of a rectangle, along the columns and along the rows [m]."""
         across, along = self._own["size"]
         return float(across), float(along)
+
+    @cached_property
+    def mesh(self) -> ClothMesh:
+        """Of the simulator, level, with its middle above the origin [m]."""
+        if self.garment:
+            return _garment(self.kind)
+        flat = grid_cloth(ROWS, COLUMNS, self.size[1], self.size[0])
+        mesh = replace(flat, nodes=np.column_stack([flat.nodes[:, :2], np.full(len(flat.nodes), REST_HEIGHT)]))
+        return one_way(mesh, COLUMNS, through=True)
+
+    @property
+    def held(self) -> list[list[int]]:
+        """Nodes of each gripper: of one cell."""
+        if self.garment:
+            return [_cell_at(self.mesh, self.kind)]
+        right = [COLUMNS * row + column for row in (ROWS - 2, ROWS - 1) for column in (COLUMNS - 2, COLUMNS - 1)]
+        left = [COLUMNS * row + column for row in (ROWS - 2, ROWS - 1) for column in (0, 1)]
+        return [right, left] if self.kind == "pair" else [right]
 
     @property
     def pad(self) -> float:
         """Side of a square of the held cell's area [m]."""
+        if self.garment:
+            area = self.mesh.face_area[np.isin(self.mesh.faces, self.held[0]).all(axis=1)].sum()
+            return math.sqrt(area)
         return math.sqrt(self.size[0] / (COLUMNS - 1) * self.size[1] / (ROWS - 1))
 
     @property
@@ -172,8 +219,22 @@ class Cloth:
         return np.stack([0.55 + away * np.cos(around), away * np.sin(around), up], axis=1)
 
     @property
+    def paths(self) -> list[Motion]:
+        """Of each pad, in the cloth's own axes. A second pad rises less, and comes nearer as it does."""
+        first = self.path
+        if self.kind != "pair":
+            return [first]
+        rng = np.random.default_rng([self.seed, 6, self.motion])
+        share, nearer = rng.uniform(0.75, 0.95), rng.uniform(0.15, 0.3) * self.size[0]
+        times = np.linspace(0, _SECONDS, _KEYS)
+        moved = first.at(times)[1] * [1, 1, share]
+        moved[:, 0] += nearer * _smooth(times / _SECONDS)
+        keys = zip(times.tolist(), moved.tolist(), strict=True)
+        return [first, Motion(tuple(Keyframe(time, (x, y, z)) for time, (x, y, z) in keys))]
+
+    @property
     def path(self) -> Motion:
-        """Of the pad, in the cloth's own axes."""
+        """Of the first pad, in the cloth's own axes."""
         rng = np.random.default_rng([self.seed, 4, self.motion])
         times = np.linspace(0, _SECONDS, _KEYS)
         if self.kind == "fold":
@@ -190,6 +251,39 @@ class Cloth:
         return Motion(tuple(Keyframe(time, (x, y, z)) for time, (x, y, z) in keys))
 
 
+def _garment(kind: str) -> ClothMesh:
+    """A garment of one layer, level, at rest height."""
+    across, along = (_lines(ends) for ends in _OUTLINES[kind])
+    flat = lined_cloth(across, along)
+    middle = flat.verts[flat.face_verts].mean(axis=1)
+    cells = [np.searchsorted(ends, middle[:, axis]) - 1 for axis, ends in enumerate(_OUTLINES[kind])]
+    kept = [cell not in _ABSENT[kind] for cell in zip(*(one.tolist() for one in cells), strict=True)]
+    nodes, faces = np.column_stack([flat.verts, np.zeros(len(flat.verts))]), flat.face_verts[kept]
+    used, faces = np.unique(faces, return_inverse=True)
+    nodes, faces = nodes[used], faces.reshape(-1, 3)
+    middle_x = across[-1] / 2
+    if kind == "skirt":
+        nodes[:, 0] = middle_x + (nodes[:, 0] - middle_x) * (1 - _TAPER * nodes[:, 1] / along[-1])
+    shift = [middle_x, along[-1] / 2, -REST_HEIGHT]
+    return cloth_of(SurfaceMesh(nodes - shift, faces))
+
+
+def _lines(ends: Sequence[float]) -> Floats:
+    parts = [np.linspace(a, b, max(round((b - a) / _GARMENT_M), 1), endpoint=False) for a, b in pairwise(ends)]
+    return np.array([*np.concatenate(parts), ends[-1]])
+
+
+def _cell_at(mesh: ClothMesh, kind: str) -> list[int]:
+    """Nodes of the cell at the held point."""
+    across, along = (_lines(ends) for ends in _OUTLINES[kind])
+    column = int(np.searchsorted(across, _SHOULDER[kind])) - 1
+    x = across[[column, column + 1]] - across[-1] / 2
+    y = along[-2:] - along[-1] / 2
+    narrow = 1 - _TAPER * along[-2:] / along[-1] if kind == "skirt" else np.ones(2)
+    wanted = np.array([[one * part, height] for part, height in zip(narrow, y, strict=True) for one in x])
+    return np.flatnonzero(np.linalg.norm(mesh.nodes[:, None, :2] - wanted, axis=2).min(axis=1) < 1e-6).tolist()
+
+
 def _smooth(share: Floats) -> Floats:
     share = np.clip(share, 0, 1)
     return np.asarray(share**3 * (10 - 15 * share + 6 * share**2))
@@ -202,14 +296,14 @@ class Moved:
     nodes: Floats
     """[T, V, 3]"""
     faces: NDArray[np.int64]
-    pad: Floats
-    """[T, 3] middle of the held nodes."""
+    pads: Floats
+    """[T, G, 3] middle of the nodes that each gripper holds."""
 
 
 def moved(cloth: Cloth, simulator: Simulator, cache: Path) -> Moved:
     """The motion of a cloth, simulated once and kept."""
     path = cache / f"{simulator}-{cloth.kind}-{cloth.seed}-{cloth.motion}.npz"
-    problem, held = _problem(cloth)
+    problem = _problem(cloth)
     if path.is_file():
         with np.load(path) as kept:
             nodes = kept["nodes"].astype(np.float64)
@@ -228,7 +322,8 @@ def moved(cloth: Cloth, simulator: Simulator, cache: Path) -> Moved:
     turn = np.array([[cosine, sine, 0], [-sine, cosine, 0], [0, 0, 1]])
     middle = problem.mesh.nodes.mean(0) * [1, 1, 0]
     world = (nodes - middle) @ turn + [*centre, table]
-    return Moved(world, problem.mesh.faces, world[:, held].mean(1))
+    pads = np.stack([world[:, held].mean(1) for held in cloth.held], axis=1)
+    return Moved(world, problem.mesh.faces, pads)
 
 
 def in_a_strip(cloth: Cloth, motion: Moved, cache: Path) -> float:
@@ -258,30 +353,25 @@ def in_a_strip(cloth: Cloth, motion: Moved, cache: Path) -> float:
 
 
 def _strain(cloth: Cloth, motion: Moved) -> float:
-    mesh = _problem(cloth)[0].mesh
+    mesh = cloth.mesh
     corner = motion.nodes[:, motion.faces]
     edges = np.stack([corner[:, :, 1] - corner[:, :, 0], corner[:, :, 2] - corner[:, :, 0]], axis=-1)
     larger = np.linalg.svd(edges @ np.linalg.inv(mesh.material_edges), compute_uv=False)[..., 0] - 1
     return float(np.sqrt(np.average((larger**2).mean(0), weights=mesh.face_area)))
 
 
-def _problem(cloth: Cloth) -> tuple[Problem, list[int]]:
-    flat = grid_cloth(ROWS, COLUMNS, cloth.size[1], cloth.size[0])
-    mesh = replace(flat, nodes=np.column_stack([flat.nodes[:, :2], np.full(len(flat.nodes), REST_HEIGHT)]))
-    mesh = one_way(mesh, COLUMNS, through=True)
-    held = [COLUMNS * row + column for row in (ROWS - 2, ROWS - 1) for column in (COLUMNS - 2, COLUMNS - 1)]
-    problem = Problem(
+def _problem(cloth: Cloth) -> Problem:
+    return Problem(
         "cloth",
-        mesh,
+        cloth.mesh,
         cloth.sheet,
         _SECONDS,
-        dict.fromkeys(held, cloth.path),
+        {node: path for held, path in zip(cloth.held, cloth.paths, strict=True) for node in held},
         table=0.0,
         friction=cloth.friction,
         self_contact=cloth.kind == "fold",
         rate=_RATE,
     )
-    return problem, held
 
 
 def seen(motion: Moved, cloth: Cloth, cameras: int, *, cut: bool) -> Episode:
@@ -301,7 +391,8 @@ def seen(motion: Moved, cloth: Cloth, cameras: int, *, cut: bool) -> Episode:
         frames.append(cloud[cloud[:, 2] > table + _CUT] if cut else cloud)
     times = np.arange(len(frames)) / _RATE
     meta = {"viewpoints": {f"camera_{index}": eye.tolist() for index, eye in enumerate(eyes)}}
-    return Episode.from_frames(frames, times, gripper=motion.pad[:, None], meta=meta)
+    grippers = ("a", "b")[: motion.pads.shape[1]]
+    return Episode.from_frames(frames, times, gripper=motion.pads, grippers=grippers, meta=meta)
 
 
 def _rays(eye: Floats) -> NDArray[np.float32]:
@@ -365,7 +456,7 @@ def fitted(one: Set, seed: int, out: Path, revision: str) -> Case:
         write_episode(path, seen(moved(cloth, one.simulator, out / "motions"), cloth, one.cameras, cut=one.cut))
     _tell(one, folder / "found", names, paths)
     command = [sys.executable, "-m", "diffcloud", "fit", *map(str, paths), "--out", str(folder / "found")]
-    command += ["--density", f"{cloths[0].sheet.density:.4f}", "--json"]
+    command += ["--density", f"{cloths[0].sheet.density:.4f}", "--budget", "none", "--json"]
     with (folder / "messages.txt").open("wb") as messages, (folder / "result.json").open("wb") as result:
         process = subprocess.Popen(command, stdout=result, stderr=messages)
         _, status, used = os.wait4(process.pid, 0)
@@ -406,14 +497,18 @@ def _upper(found: Path) -> float:
 def _tell(one: Set, found: Path, names: dict[str, Cloth], paths: Sequence[Path]) -> None:
     """Write what is known into cloth.yaml and recordings.yaml."""
     first = next(iter(names.values()))
-    size = first.size if one.told else None
+    size = first.size if one.told and not first.garment else None
     found.mkdir(parents=True, exist_ok=True)
     for name in ("cloth.yaml", "recordings.yaml"):
         (found / name).unlink(missing_ok=True)
-    if one.told:
+    mesh = found / "cloth.obj" if first.garment else None
+    if mesh is not None:  # of the same shape, as fine as a program for garments exports it
+        finer, _ = refined(first.mesh)
+        write_surface(mesh, SurfaceMesh(finer.nodes, finer.faces))
+    if one.told and one.kind in ("lift", "fold"):
         blocks = {name: _told(cloth) for name, cloth in names.items()}
         write_text(found / "recordings.yaml", yaml.safe_dump(blocks))
-    find_scene(paths, found, size, first.sheet.density)
+    find_scene(paths, found, size, first.sheet.density, mesh=mesh)
     cloth = yaml.safe_load((found / "cloth.yaml").read_text())
     cloth["grip_m"] = first.pad if one.told else first.stated_pad
     cloth["air"] = "none"  # neither simulator has any

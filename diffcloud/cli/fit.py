@@ -52,6 +52,7 @@ def fit(
     out: Annotated[Path, typer.Option(help="Folder for fit.json, intervals.json, report.html and the scene.")],
     settings: Mapping[str, Any],
     size: Annotated[str | None, typer.Option(help="Sides in m, such as 0.40x0.30. Default: from the first frame.")] = None,
+    mesh: Annotated[Path | None, typer.Option(help="OBJ file of a cloth that is no rectangle, in metres.")] = None,
     density: Annotated[
         str | None, typer.Option(help="Mass per area in kg/m², such as 0.24 or 0.24+-0.01. Default: estimated.")
     ] = None,
@@ -93,8 +94,8 @@ def fit(
     stored = None if params is None else load_config(params).fit
     members = _members(recordings, scene)
     known = all(named is not None for _, named in members.values())
-    if known and (size or density):
-        raise ConfigError("--size and --density are for a scene that is found; leave them out beside a known one.")
+    if known and (size or density or mesh):
+        raise ConfigError("--size, --mesh and --density are for a scene that is found; leave them out beside a known one.")
     if known and dvc:
         raise ConfigError("--dvc makes a project of a scene that is found; leave it out beside a known one.")
     results = {}
@@ -106,7 +107,7 @@ def fit(
                 task = _known(group, folder, topic or (), settings, stored or FitSettings(), init)
             else:
                 paths = [path for path, _ in group.values()]
-                task = _found(paths, folder, sides, weighed, topic or (), settings, stored, init)
+                task = _found(paths, folder, sides, mesh, weighed, topic or (), settings, stored, init)
             left = None if seconds is None else max(_FITTING * seconds - (time.monotonic() - began), 1.0)
             told, summary = task.run(left)
             _show(summary, folder)
@@ -162,6 +163,7 @@ def _found(
     recordings: Sequence[Path],
     out: Path,
     size: tuple[float, float] | None,
+    mesh: Path | None,
     weighed: tuple[float, float] | None,
     topics: Sequence[str],
     typed: Mapping[str, Any],
@@ -175,7 +177,7 @@ def _found(
     from diffcloud.jobs.scene_files import find_scene
     from diffcloud.scene.scenarios.catalogue import make_scenario, own_options
 
-    episodes, cloth, layouts = find_scene(recordings, out, size, None if weighed is None else weighed[0], topics)
+    episodes, cloth, layouts = find_scene(recordings, out, size, None if weighed is None else weighed[0], topics, mesh)
     if weighed is not None and weighed[1]:
         cloth = with_density(cloth, *weighed)
     scenes = {name: {**cloth, **fields} for name, fields in layouts.items()}

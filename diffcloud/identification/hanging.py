@@ -43,7 +43,7 @@ _EDGE = 0.01
 """Quantile of coordinates that is taken as the end of the cloud, because of noise."""
 _TAUT = 0.96
 """Span above which the cloth counts as taut."""
-_CAP_M, _WORST_M = 0.05, 0.025
+CAP_M, WORST_M = 0.05, 0.025
 """Cap of a single distance, and largest accepted RMS distance of the best hypothesis [m]."""
 _TIE, _SAME = 1.25, 1.1
 """Factors of the RMS distance within which hypotheses count as equal, at rest and in motion."""
@@ -83,7 +83,7 @@ def hangs(episode: Episode) -> bool:
     """Return whether the first cloud is upright and below the gripper."""
     if episode.gripper is None:
         return False
-    cloud = _first_cloud(episode)
+    cloud = first_cloud(episode)
     low, high = np.quantile(cloud, [_EDGE, 1 - _EDGE], axis=0)
     wide = float(np.linalg.norm((high - low)[:2]))
     return bool(high[2] - low[2] > _UPRIGHT * wide and episode.gripper[0, 0, 2] > np.median(cloud[:, 2]))
@@ -91,7 +91,7 @@ def hangs(episode: Episode) -> bool:
 
 def hanging_size(episode: Episode) -> tuple[float, float]:
     """Return the extents [m] of the first cloud, longer one first: the sides of a cloth that hangs from a side."""
-    cloud = _first_cloud(episode)
+    cloud = first_cloud(episode)
     along, _ = _axes(cloud)
     sides = [float(np.ptp(np.quantile(values, [_EDGE, 1 - _EDGE]))) for values in (cloud @ along, cloud[:, 2])]
     return max(sides), min(sides)
@@ -125,14 +125,54 @@ def find_hanging(episode: Episode, cloth: Mapping[str, Any]) -> Layout:
             message has all distances.
     """
     assert episode.gripper is not None
-    if len(episode.grippers) > 1:
+    if len(episode.grippers) > 2:
         raise EpisodeError(
-            f"The recording has the grippers {', '.join(episode.grippers)}. A hanging cloth may be held by one. If only "
-            "one holds the cloth, leave the other tracks out."
+            f"The recording has the grippers {', '.join(episode.grippers)}. A hanging cloth is held by one, or by two at "
+            "the corners of a side. Leave the other tracks out."
         )
-    cloud, gripper = _first_cloud(episode), episode.gripper[:, 0]
+    cloud, grippers = first_cloud(episode), episode.gripper[0]
+    shared = hanging_course(episode)
+    base = {**cloth, **{name: one.value for name, one in shared.items()}}
+    tried: list[_Hypothesis] = []
+    for fields in _ways(cloud, tuple(cloth["size_m"])):
+        if len(grippers) > 1 and fields["held"] != "corners":
+            continue
+        options = own_options({**base, **fields}, "hang", "the cloth", folder=Path())
+        assert isinstance(options, HangScenario)
+        try:
+            tried.append(_held_by(_placed(options, cloud), episode))
+        except SceneError:  # it does not come to rest
+            continue
+    tried.sort(key=lambda one: one.rms_m)
+    scores = "; ".join(one.words for one in tried)
+    if not tried or tried[0].rms_m > WORST_M:
+        raise EpisodeError(
+            f"The first cloud is not that of a cloth of {' x '.join(f'{x:g}' for x in cloth['size_m'])} m that hangs at "
+            f"rest. RMS distances: {scores}; at most {1e3 * WORST_M:.0f} mm are allowed. Check --size, that clouds and "
+            "gripper are in metres in one frame with z up, and that the cloud shows the whole cloth and nothing else."
+        )
+    ties = [one for one in tried if one.rms_m < _TIE * tried[0].rms_m]
+    best, reason = _by_motion(ties, episode) if len(ties) > 1 else (ties[0], "nearest to the first cloud")
+    chosen = best.options
+    warnings = refuse_far(np.array(chosen.rim_m), grippers.mean(axis=0))
+    found = {
+        "held": Found(chosen.held, f"{reason}: {scores}"),
+        "side": Found(chosen.side, "the held side, along the cloth's own x or y"),
+        "rim_m": Found([round(x, 4) for x in chosen.rim_m], "where the settled cloth is nearest to the first cloud"),
+        "yaw_deg": Found(round(chosen.yaw_deg % 360, 2), "likewise"),
+        "span": Found(round(chosen.span, 3), "distance of the held corners over the length of their side"),
+        **({"grippers": Found(list(chosen.grippers), "gripper of each corner")} if len(grippers) > 1 else {}),
+        **shared,
+    }
+    return Layout(found, tuple(warnings))
+
+
+def hanging_course(episode: Episode) -> dict[str, Found]:
+    """Return the scenario fields of time and path of a recording that begins with a hanging cloth."""
+    assert episode.gripper is not None
+    gripper = episode.gripper[:, 0]
     interval = float(np.median(np.diff(episode.times))) if episode.frame_count > 1 else 0.1
-    shared = {
+    return {
         "rate_hz": Found(round(1 / interval, 6), f"frames are {interval:.4f} s apart"),
         "frames": Found(
             max(math.ceil(float(episode.times[-1]) / interval), 1), f"the recording ends at {episode.times[-1]:.3f} s"
@@ -143,52 +183,29 @@ def find_hanging(episode: Episode, cloth: Mapping[str, Any]) -> Layout:
             "first and last position of the gripper; fits follow its recorded track",
         ),
     }
-    base = {**cloth, **{name: one.value for name, one in shared.items()}}
-    tried: list[_Hypothesis] = []
-    for fields in _ways(cloud, tuple(cloth["size_m"])):
-        options = own_options({**base, **fields}, "hang", "the cloth", folder=Path())
-        assert isinstance(options, HangScenario)
-        try:
-            tried.append(_aligned(options, cloud))
-        except SceneError:  # it does not come to rest
-            continue
-    tried.sort(key=lambda one: one.rms_m)
-    scores = "; ".join(one.words for one in tried)
-    if not tried or tried[0].rms_m > _WORST_M:
-        raise EpisodeError(
-            f"The first cloud is not that of a cloth of {' x '.join(f'{x:g}' for x in cloth['size_m'])} m that hangs at "
-            f"rest. RMS distances: {scores}; at most {1e3 * _WORST_M:.0f} mm are allowed. Check --size, that clouds and "
-            "gripper are in metres in one frame with z up, and that the cloud shows the whole cloth and nothing else."
-        )
-    ties = [one for one in tried if one.rms_m < _TIE * tried[0].rms_m]
-    best, reason = _by_motion(ties, episode) if len(ties) > 1 else (ties[0], "nearest to the first cloud")
-    chosen = best.options
-    away = float(np.linalg.norm(np.array(chosen.rim_m) - gripper[0]))
+
+
+def refuse_far(held: Floats, gripper: Floats) -> list[str]:
+    """Return a warning if the held part [3] is not at the gripper [3].
+
+    Raises:
+        EpisodeError: it is more than 0.25 m away.
+    """
+    away = float(np.linalg.norm(held - gripper))
     if away > _FAR_M:
         raise EpisodeError(
             f"The held part of the cloth is {away:.2f} m from the gripper; at most {_FAR_M:g} m are allowed. Clouds and "
             "gripper must be in one frame, in metres, z up."
         )
-    warnings = []
-    if away > _NEAR_M:
-        warnings.append(
-            f"the held part of the cloth is {1e3 * away:.0f} mm from the gripper; it follows the gripper without turning"
-        )
-    found = {
-        "held": Found(chosen.held, f"{reason}: {scores}"),
-        "side": Found(chosen.side, "the held side, along the cloth's own x or y"),
-        "rim_m": Found([round(x, 4) for x in chosen.rim_m], "where the settled cloth is nearest to the first cloud"),
-        "yaw_deg": Found(round(chosen.yaw_deg % 360, 2), "likewise"),
-        "span": Found(round(chosen.span, 3), "distance of the held corners over the length of their side"),
-        **shared,
-    }
-    return Layout(found, tuple(warnings))
+    if away <= _NEAR_M:
+        return []
+    return [f"the held part of the cloth is {1e3 * away:.0f} mm from the gripper; it follows the gripper without turning"]
 
 
-def _first_cloud(episode: Episode) -> Floats:
+def first_cloud(episode: Episode) -> Floats:
     """Return points [N, 3] of the frames before the gripper moves [m]."""
     assert episode.gripper is not None
-    way = np.linalg.norm(episode.gripper[:, 0] - episode.gripper[0, 0], axis=1)
+    way = np.linalg.norm(episode.gripper - episode.gripper[0], axis=2).max(axis=1)
     still = int(np.argmax(way > _STILL_M)) if (way > _STILL_M).any() else episode.frame_count
     points = np.concatenate([episode.frame(frame) for frame in range(min(max(still, 1), _FIRST_FRAMES))])
     return points[:: max(len(points) // _FIRST_POINTS, 1)].astype(np.float64)
@@ -223,14 +240,41 @@ def _ways(cloud: Floats, size: tuple[float, float]) -> list[dict[str, Any]]:
     return [*ways, *({"held": "corner", "rim_m": highest.tolist(), "yaw_deg": (yaw + turn) % 360} for turn in turns)]
 
 
-def _aligned(options: HangScenario, cloud: Floats) -> _Hypothesis:
-    """Align a settled cloth with the cloud by translation and rotation about the vertical (ICP)."""
-    scene = hang_scenario(options).scene
-    nodes, faces, rim = scene.mesh.nodes, scene.mesh.faces, np.array(options.rim_m)
+def _placed(options: HangScenario, cloud: Floats) -> _Hypothesis:
+    """Align a settled cloth with the cloud."""
+    mesh = hang_scenario(options).scene.mesh
+    rim, turned, rms = aligned(mesh.nodes, mesh.faces, np.array(options.rim_m), cloud)
+    x, y, z = rim.tolist()
+    placed = {"rim_m": (x, y, z), "yaw_deg": (options.yaw_deg + math.degrees(turned)) % 360}
+    return _Hypothesis(options.model_copy(update=placed), rms)
+
+
+def _held_by(one: _Hypothesis, episode: Episode) -> _Hypothesis:
+    """Assign each of two held corners to the gripper at its place."""
+    assert episode.gripper is not None
+    names = episode.grippers
+    if len(names) == 1:
+        return one
+    options, yaw = one.options, math.radians(one.options.yaw_deg)
+    along = options.span * options.size_m["xy".index(options.side)] * np.array([math.cos(yaw), math.sin(yaw), 0.0])
+    apart = episode.gripper[0, 1] - episode.gripper[0, 0]
+    ordered = names if float(apart @ along) > 0 else names[::-1]
+    return replace(one, options=options.model_copy(update={"grippers": ordered}))
+
+
+def aligned(nodes: Floats, faces: NDArray[np.int64], held: Floats, cloud: Floats) -> tuple[Floats, float, float]:
+    """Align a settled cloth [V, 3] with the cloud [N, 3] by translation and rotation about the vertical (ICP).
+
+    Args:
+        held: [3] a point that moves with the cloth.
+
+    Returns:
+        The moved point [3], the rotation [rad], and the RMS distance [m].
+    """
     turned = 0.0
     for _ in range(_ALIGNING):
-        place = _on_surface(cloud, nodes, faces)
-        near = np.linalg.norm(cloud - place, axis=1) < _CAP_M
+        place = on_surface(cloud, nodes, faces)
+        near = np.linalg.norm(cloud - place, axis=1) < CAP_M
         if near.sum() < 3:
             break
         a, b = place[near], cloud[near]
@@ -241,16 +285,18 @@ def _aligned(options: HangScenario, cloud: Floats) -> _Hypothesis:
         cosine, sine = math.cos(angle), math.sin(angle)
         turn = np.array([[cosine, sine, 0.0], [-sine, cosine, 0.0], [0.0, 0.0, 1.0]])  # for row vectors
         shift = b.mean(axis=0) - a.mean(axis=0) @ turn
-        nodes, rim, turned = nodes @ turn + shift, rim @ turn + shift, turned + angle
-    forth = np.linalg.norm(cloud - _on_surface(cloud, nodes, faces), axis=1)
+        nodes, held, turned = nodes @ turn + shift, held @ turn + shift, turned + angle
+    return held, turned, both_ways(cloud, nodes, faces)
+
+
+def both_ways(cloud: Floats, nodes: Floats, faces: NDArray[np.int64]) -> float:
+    """Return the RMS distance between a cloud and a mesh in both directions, of distances of at most 50 mm [m]."""
+    forth = np.linalg.norm(cloud - on_surface(cloud, nodes, faces), axis=1)
     back = cKDTree(cloud).query(nodes[faces].mean(axis=1))[0]
-    rms = math.sqrt(0.5 * sum(float((np.minimum(one, _CAP_M) ** 2).mean()) for one in (forth, back)))
-    x, y, z = rim.tolist()
-    placed = {"rim_m": (x, y, z), "yaw_deg": (options.yaw_deg + math.degrees(turned)) % 360}
-    return _Hypothesis(options.model_copy(update=placed), rms)
+    return math.sqrt(0.5 * sum(float((np.minimum(one, CAP_M) ** 2).mean()) for one in (forth, back)))
 
 
-def _on_surface(points: Floats, nodes: Floats, faces: NDArray[np.int64]) -> Floats:
+def on_surface(points: Floats, nodes: Floats, faces: NDArray[np.int64]) -> Floats:
     """Return the nearest point [N, 3] on a mesh to each of N points."""
     found, weights = find_on_surface(points[None], NO_GUESS, np.ascontiguousarray(nodes)[None], faces)
     return np.asarray((nodes[faces[found[0]]] * weights[0][..., None]).sum(axis=1))
@@ -279,7 +325,7 @@ def _by_motion(ties: list[_Hypothesis], episode: Episode) -> tuple[_Hypothesis, 
         squares = []
         for nodes, frame in zip(run, frames, strict=True):
             points = episode.frame(frame).astype(np.float64)
-            squares.append(float(((points - _on_surface(points, nodes, system.mesh.faces)) ** 2).sum(axis=1).mean()))
+            squares.append(float(((points - on_surface(points, nodes, system.mesh.faces)) ** 2).sum(axis=1).mean()))
         scores.append(math.sqrt(float(np.mean(squares))))
     alike = [one for one, score in zip(ties, scores, strict=True) if score <= _SAME * min(scores)]
     order = {"edge": 0, "corners": 1, "corner": 2}

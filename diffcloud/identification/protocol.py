@@ -11,10 +11,11 @@ import numpy as np
 
 from diffcloud.errors import ConfigError, EpisodeError
 from diffcloud.estimation.settings import FitSettings
-from diffcloud.identification.hanging import find_hanging, hanging_size, hangs, prepared
+from diffcloud.identification.hanging import HANG_FIELDS, find_hanging, hanging_size, hangs, prepared
+from diffcloud.identification.meshes import MESH_FIELDS, find_mesh
 from diffcloud.io.episodes import Episode
 from diffcloud.scene.scenarios import Scenario
-from diffcloud.scene.scenarios.layout import Found, Layout, find_layout, found_size, node_counts
+from diffcloud.scene.scenarios.layout import FIELDS, Found, Layout, find_layout, found_size, node_counts, refuse_no_track
 from diffcloud.sim.grasp import GRIP_M
 
 _DENSITY = 0.16
@@ -32,26 +33,40 @@ _HANGING_UNCERTAIN = {
     "air_density": 2.0,
 }
 """The air's are wide: the sheet swings through it, and theory for a flat plate is a guess."""
-_HANGING_NODES = 7
+_HANGING_NODES, _MESH_NODES = 7, 300
 _STEPS = 16
 _GRIP_KNOWN = 1.5
 
 
 def found_cloth(
-    episodes: Sequence[Episode], size: tuple[float, float] | None = None, density: float | None = None
+    episodes: Sequence[Episode],
+    size: tuple[float, float] | None = None,
+    density: float | None = None,
+    mesh: Path | None = None,
 ) -> dict[str, Found]:
     """Return the scenario fields that all recordings of one cloth share, each with its reason.
 
     Args:
-        size: side lengths [m]. Default: estimated from the first frames.
+        size: side lengths of a rectangle [m]. Default: estimated from the first frames.
         density: measured mass per area [kg/m²].
+        mesh: OBJ file of a cloth of another shape [m].
+
+    Raises:
+        EpisodeError: the recordings begin differently, or a first frame shows no cloth at rest.
+        ConfigError: both size and mesh are given.
     """
+    if mesh is not None and size is not None:
+        raise ConfigError("--mesh states the shape of the cloth, and --size the sides of a rectangle. Give one of them.")
     hanging = [hangs(episode) for episode in episodes]
     if any(hanging) and not all(hanging):
         raise EpisodeError(
             "In some recordings the cloth hangs at the start, in others it lies flat. Fit those that hang and those "
             "that lie in two commands, with two folders for --out."
         )
+    told = "as weighed" if density is not None else "usual for a knit; fitted"
+    material = {"density_kg_m2": density or _DENSITY, **_MATERIAL}
+    if mesh is not None:
+        return _found_mesh(mesh, material, told, hanging=all(hanging))
     reason = "as stated"
     if size is None:
         sides = np.array([hanging_size(episode) if all(hanging) else found_size(episode) for episode in episodes])
@@ -59,8 +74,6 @@ def found_cloth(
         reason = "rectangle around the first frames" + (
             f"; recordings differ by up to {np.ptp(sides, axis=0).max():.3f} m" if len(sides) > 1 else ""
         )
-    told = "as weighed" if density is not None else "usual for a knit; fitted"
-    material = {"density_kg_m2": density or _DENSITY, **_MATERIAL}
     if all(hanging):
         nodes = [max(round((_HANGING_NODES - 1) * side / max(size)) + 1, 4) for side in size]
         return {
@@ -68,10 +81,7 @@ def found_cloth(
             "size_m": Found(list(size), reason),
             "nodes": Found(nodes, f"{_HANGING_NODES} along the longer side: a hanging cloth bends little"),
             "grip_m": Found(GRIP_M, "size of the grasp at a corner; measure your gripper's [m]"),
-            "air": Found("still", "air moves with a hanging cloth; none for simulators without air"),
-            "material": Found(material, f"nominal material; density {told}"),
-            "compression": Found(_AROUND["compression"], "usual; fitted too, within `uncertain`"),
-            "uncertain": Found(_HANGING_UNCERTAIN, "priors of what is fitted too: factors of one standard deviation"),
+            **_hanging(material, told),
         }
     return {
         "base": Found("lift", "a rectangular cloth on a table"),
@@ -80,6 +90,45 @@ def found_cloth(
         "grip": Found(
             "pad", "fingers level; or upright_pad (pinched from above), or pivot (a point that lets the cloth turn)"
         ),
+        **_flat(material, told),
+    }
+
+
+def _found_mesh(mesh: Path, material: Mapping[str, float], told: str, *, hanging: bool) -> dict[str, Found]:
+    """Return the fields of a cloth of any shape."""
+    if not mesh.is_file():
+        raise ConfigError(f"--mesh takes an OBJ file, and there is none at {mesh}.")
+    shared = {
+        "base": Found("mesh", "a cloth in the shape of a triangle mesh"),
+        "mesh": Found(str(mesh.resolve()), "as stated; its edges have their lengths at rest"),
+        "nodes": Found(_MESH_NODES, "a mesh of more than 500 nodes is simplified to about this number"),
+        "start": Found("hang" if hanging else "flat", "hanging from the gripper" if hanging else "on a table"),
+    }
+    if hanging:
+        size = Found(GRIP_M, "size of the grasp; measure your gripper's [m]")
+        pivot = Found("pivot", "a point that lets the cloth turn; or pad, which keeps its direction")
+        apart = Found(False, "layers that touch take longer")
+        return {**shared, "grip": pivot, "grip_m": size, "self_contact": apart, **_hanging(material, told)}
+    return {
+        **shared,
+        "grip": Found("pad", "fingers level; or pivot (a point that lets the cloth turn)"),
+        **_flat(material, told),
+    }
+
+
+def _hanging(material: Mapping[str, float], told: str) -> dict[str, Found]:
+    """Return the fields that all hanging cloths share."""
+    return {
+        "air": Found("still", "air moves with a hanging cloth; none for simulators without air"),
+        "material": Found(material, f"nominal material; density {told}"),
+        "compression": Found(_AROUND["compression"], "usual; fitted too, within `uncertain`"),
+        "uncertain": Found(_HANGING_UNCERTAIN, "priors of what is fitted too: factors of one standard deviation"),
+    }
+
+
+def _flat(material: Mapping[str, float], told: str) -> dict[str, Found]:
+    """Return the fields that all cloths on a table share."""
+    return {
         "grip_m": Found(GRIP_M, "side of the pad, or of the square that a pivot stands for; measure your gripper's [m]"),
         "grip_known_within": Found(_GRIP_KNOWN, "factor within which grip_m is known; 1.05 if you have measured it"),
         "material": Found(material, f"nominal material; density {told}"),
@@ -89,34 +138,44 @@ def found_cloth(
     }
 
 
+def starts_hanging(cloth: Mapping[str, Any]) -> bool:
+    """Return whether the cloth of these fields hangs at the start."""
+    return cloth["base"] == "hang" or cloth.get("start") == "hang"
+
+
+def missing_fields(cloth: Mapping[str, Any], layout: Mapping[str, Any] | None = None) -> list[str]:
+    """Return the names of fields that a cloth, or the layout of a recording of it, must state and does not."""
+    base = cloth.get("base")
+    if layout is None:
+        own = {"hang": ("size_m",), "mesh": ("mesh", "start", "grip")}.get(str(base), ("size_m", "grip", "steps_per_frame"))
+        return [name for name in ("base", *own, "nodes", "material", "grip_m") if name not in cloth]
+    needed: tuple[str, ...] = HANG_FIELDS if base == "hang" else FIELDS
+    if base == "mesh":
+        needed = MESH_FIELDS[cloth["start"]]
+    elif base != "hang" and "grippers" not in layout:
+        needed = (*needed, "grasped")
+    return [name for name in needed if name not in layout]
+
+
 def found_layout(episode: Episode, cloth: Mapping[str, Any]) -> Layout:
     """Return the scenario fields of one recording, and warnings.
 
     Args:
-        episode: recording in metres, z up, with the track of one gripper.
+        episode: recording in metres, z up, with the tracks of its grippers.
         cloth: values of the fields of `found_cloth`.
 
     Raises:
         EpisodeError: the recording does not show the cloth at rest, flat or hanging. The message has the reason.
     """
-    if cloth["base"] == "hang":
+    refuse_no_track(episode)
+    stamps = ""
+    if starts_hanging(cloth):
         episode, stamps = prepared(episode)
-        layout = find_hanging(episode, cloth)
+    if cloth["base"] in ("mesh", "hang"):
+        layout = (find_mesh if cloth["base"] == "mesh" else find_hanging)(episode, cloth)
         return replace(layout, warnings=(*filter(None, [stamps]), *layout.warnings))
     width, height = cloth["size_m"]
     return find_layout(episode, (float(width), float(height)), 0.0 if cloth["grip"] == "pivot" else float(cloth["grip_m"]))
-
-
-def with_material_path(fields: Mapping[str, Any], folder: Path) -> dict[str, Any]:
-    """Return the fields of a scenario file with the absolute path of its material file, for use in another folder.
-
-    Args:
-        folder: folder of the scenario file.
-    """
-    material = fields.get("material")
-    if not (isinstance(material, str) and material.endswith(".json")):
-        return dict(fields)
-    return {**fields, "material": str((folder / material).resolve())}
 
 
 def known_grip(size: float) -> dict[str, float]:

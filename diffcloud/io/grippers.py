@@ -32,6 +32,32 @@ class GripperTracks:
     """[T] since the first frame [s]. None if the files have no column t_s."""
 
 
+def tracks_beside(folder: Path) -> dict[str, Path]:
+    """Find the tracks in a folder of clouds: `gripper.csv`, or one `gripper_NAME.csv` for each of several grippers.
+
+    Returns:
+        Gripper name -> CSV file.
+
+    Raises:
+        EpisodeError: there is no track, only one of several, or both kinds.
+    """
+    single, several = folder / "gripper.csv", sorted(folder.glob("gripper_*.csv"))
+    if single.is_file() and not several:
+        return {ONLY_GRIPPER[0]: single}
+    if len(several) > 1 and not single.is_file():
+        return {path.stem.removeprefix("gripper_"): path for path in several}
+    if not several:
+        raise EpisodeError(
+            f"{folder} holds no gripper.csv with the columns t_s, x, y, z [m], one row a frame. For several grippers, give "
+            "one file each, such as gripper_left.csv and gripper_right.csv."
+        )
+    found = ", ".join(path.name for path in (*filter(Path.is_file, [single]), *several))
+    raise EpisodeError(
+        f"{folder} holds {found}. A single gripper has gripper.csv, and each of several has gripper_NAME.csv. Add the "
+        "missing track, or rename the file."
+    )
+
+
 def read_tracks(files: Mapping[str, Path], frames: int, stamps: NDArray[np.float64] | None = None) -> GripperTracks:
     """Read the tracks of one or several grippers.
 

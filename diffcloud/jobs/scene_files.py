@@ -11,22 +11,21 @@ import yaml
 
 from diffcloud.console import warn
 from diffcloud.errors import ConfigError, DiffCloudError, EpisodeError
-from diffcloud.identification import HANG_FIELDS, found_cloth, found_layout, prepared, with_material_path
+from diffcloud.identification import found_cloth, found_layout, missing_fields, prepared, starts_hanging
 from diffcloud.io.episodes import Episode, read_episode, write_episode
 from diffcloud.io.files import files_in, read_json, read_yaml, together, write_json, write_text
 from diffcloud.io.fingerprints import fingerprint
+from diffcloud.io.grippers import tracks_beside
 from diffcloud.io.imports import cloud_folder
 from diffcloud.io.recordings import write_recording
 from diffcloud.io.ros.recording import ros_recording
 from diffcloud.jobs.preprocess import PreprocessJob
 from diffcloud.jobs.scenarios import own_scene
 from diffcloud.jobs.settings import Config
-from diffcloud.scene.scenarios.catalogue import make_scenario, own_options
-from diffcloud.scene.scenarios.layout import FIELDS, Found
+from diffcloud.scene.scenarios.catalogue import make_scenario, own_options, with_paths
+from diffcloud.scene.scenarios.layout import Found
 
 _BAGS = (".bag", ".mcap", ".db3")
-_CLOTH_FIELDS = ("base", "size_m", "nodes", "material", "grip_m")
-_FLAT_FIELDS = (*_CLOTH_FIELDS, "grip", "steps_per_frame")
 _HEAD = "# Found by diffcloud fit, with the reason beside each value. Edit and run the command again to overrule."
 
 
@@ -36,6 +35,7 @@ def find_scene(
     size: tuple[float, float] | None,
     mass: float | None,
     topics: Sequence[str] = (),
+    mesh: Path | None = None,
 ) -> tuple[dict[str, Episode], dict[str, Any], dict[str, dict[str, Any]]]:
     """Read the recordings and their scene. Values missing in cloth.yaml and recordings.yaml are estimated and added.
 
@@ -53,8 +53,8 @@ def find_scene(
     episodes = read_all(names, out, topics)
     path = out / "recordings.yaml"
     with together():  # after an error, no partial result may affect the next run
-        cloth = _cloth(out, episodes, size, mass)
-        if cloth["base"] == "hang":
+        cloth = _cloth(out, episodes, size, mass, mesh)
+        if starts_hanging(cloth):
             episodes = {name: _prepared(name, episode, out) for name, episode in episodes.items()}
         stated = read_fields(path).keys() if path.is_file() else set[str]()
         layouts = _layouts(out, episodes, names, cloth)
@@ -127,10 +127,7 @@ def read_recording(path: Path, name: str, out: Path, topics: Sequence[str], *, k
             warn(f"{name}: {message}")
         return read_episode(kept)
     else:
-        track = path / "gripper.csv"
-        if not track.is_file():
-            raise EpisodeError(f"{path} holds no gripper.csv with the columns t_s, x, y, z [m], one row a frame.")
-        episode = cloud_folder(path, grippers={"gripper": track})
+        episode = cloud_folder(path, grippers=tracks_beside(path))
     write_episode(kept, episode)
     return episode
 
@@ -169,19 +166,27 @@ def _unpacked(bag: Path, folder: Path, topics: Sequence[str]) -> Path:
 
 
 def _cloth(
-    out: Path, episodes: Mapping[str, Episode], stated: tuple[float, float] | None, mass: float | None
+    out: Path,
+    episodes: Mapping[str, Episode],
+    stated: tuple[float, float] | None,
+    mass: float | None,
+    mesh: Path | None,
 ) -> dict[str, Any]:
     """Return the fields of cloth.yaml. If the file does not exist, detect and write them."""
     path = out / "cloth.yaml"
     if path.is_file():
         fields = read_fields(path)
-        _refuse_missing(fields, _CLOTH_FIELDS if fields.get("base") == "hang" else _FLAT_FIELDS, str(path))
+        _refuse_missing(missing_fields(fields), str(path))
         own_options(fields, "cloth", path, folder=out)
-        if stated is not None and list(stated) != fields["size_m"]:
-            other = f"--size {stated[0]:g}x{stated[1]:g}"
-            warn(f"{path} says size_m {fields['size_m']}, and that counts, not {other}: edit the file.")
-        return with_material_path(fields, out)  # resolve the path, because scenarios are written to another folder
-    found = found_cloth(list(episodes.values()), stated, mass)
+        fields = with_paths(fields, out)  # resolve the paths, because scenarios are written to another folder
+        for name, option, given in (
+            ("size_m", "--size", None if stated is None else list(stated)),
+            ("mesh", "--mesh", None if mesh is None else str(mesh.resolve())),
+        ):
+            if given is not None and given != fields.get(name):
+                warn(f"{path} says {name} {fields.get(name)}, and that counts, not {option} {given}: edit the file.")
+        return fields
+    found = found_cloth(list(episodes.values()), stated, mass, mesh)
     write_text(path, _yaml(found))
     return {name: entry.value for name, entry in found.items()}
 
@@ -198,7 +203,7 @@ def _layouts(
             if not isinstance(known[name], dict):
                 raise ConfigError(f"{path}: {name} must be a mapping of a scenario's fields, got {known[name]!r:.60}.")
             layouts[name] = dict(known[name])
-            _refuse_missing(layouts[name], HANG_FIELDS if cloth["base"] == "hang" else FIELDS, f"{path}: {name}")
+            _refuse_missing(missing_fields(cloth, layouts[name]), f"{path}: {name}")
             where = f"{out / 'cloth.yaml'} with {name} of {path}"
             options = own_options({**cloth, **layouts[name]}, name, where, folder=out)
             try:
@@ -238,9 +243,8 @@ def _warn_of_changes(out: Path, episodes: Mapping[str, Episode], stated: Collect
     write_json(path, known)
 
 
-def _refuse_missing(fields: Mapping[str, Any], needed: Sequence[str], where: str) -> None:
+def _refuse_missing(missing: Sequence[str], where: str) -> None:
     """Refuse missing fields. Otherwise defaults of the built-in scenario would silently replace them."""
-    missing = [name for name in needed if name not in fields]
     if missing:
         raise ConfigError(f"{where} lacks {', '.join(missing)}. Put it back, or remove the whole to have it found anew.")
 
@@ -270,4 +274,4 @@ def scene_fields(source: str) -> dict[str, Any] | None:
     None for a built-in or a scene JSON, which later commands find by name.
     """
     path = own_scene(source)
-    return None if path is None else with_material_path(read_fields(path), path.parent)
+    return None if path is None else with_paths(read_fields(path), path.parent)

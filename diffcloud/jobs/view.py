@@ -13,6 +13,7 @@ from diffcloud.identification import found_cloth, found_layout
 from diffcloud.io.clouds import FORMATS
 from diffcloud.io.episodes import Episode
 from diffcloud.io.files import files_in
+from diffcloud.io.grippers import tracks_beside
 from diffcloud.io.imports import cloud_folder
 from diffcloud.scene.scenarios import Scenario
 from diffcloud.scene.scenarios.catalogue import make_scenario, own_options
@@ -35,14 +36,13 @@ def is_cloud_folder(path: Path) -> bool:
 
 
 def cloud_recording(path: Path) -> tuple[Episode, list[str]]:
-    """Read a folder of numbered clouds, with its `gripper.csv` if there is one. Return the episode and what is missing.
+    """Read a folder of numbered clouds, with its tracks if there are any. Return the episode and what is missing.
 
     Raises:
         EpisodeError: a damaged cloud or track.
     """
-    track = path / "gripper.csv"
-    if track.is_file():
-        return cloud_folder(path, grippers={"gripper": track}), []
+    if any(path.glob("gripper*.csv")):
+        return cloud_folder(path, grippers=tracks_beside(path)), []
     try:
         return cloud_folder(path), []
     except EpisodeError as error:

@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,7 +14,8 @@ from diffcloud.identification.hanging import hanging_size, hangs
 from diffcloud.io.episodes import Episode
 from diffcloud.io.stamps import corrected_stamps, stamp_lags
 from diffcloud.jobs.view import proposed_scene
-from diffcloud.scene.scenarios import built_in
+from diffcloud.scene.scenarios import built_in, make_scenario
+from diffcloud.scene.scenarios.catalogue import own_options
 from diffcloud.scene.scenarios.hang import HangScenario, hang_scenario
 from diffcloud.sim.motion import Keyframe, Motion
 from diffcloud.sim.simulate import rollout
@@ -128,11 +130,27 @@ class TestLayout:
         with pytest.raises(EpisodeError, match="from the gripper; at most"):
             found_layout(episode, cloth_of(episode, (0.30, 0.24)))
 
-    def test_two_grippers_are_refused(self):
+    @pytest.mark.parametrize("names", [("left", "right"), ("right", "left")])
+    def test_two_grippers_hold_two_corners(self, names):
+        truth = options(held="corners", span=0.9)
+        episode = recorded(truth)
+        yaw = np.radians(truth.yaw_deg)
+        half = 0.5 * 0.9 * 0.30 * np.array([np.cos(yaw), np.sin(yaw), 0.0])
+        track = np.stack([episode.gripper[:, 0] - half, episode.gripper[:, 0] + half], axis=1)
+        episode, _ = prepared(replace(episode, gripper=track, grippers=names))
+        cloth = cloth_of(episode, (0.30, 0.24))
+        fields = cloth | {name: one.value for name, one in found_layout(episode, cloth).fields.items()}
+        scenario = make_scenario(own_options(fields, "hang", "test", folder=Path()))
+        assert scenario.scene.handles.grippers == tuple(fields["grippers"])
+        for name, handle in zip(fields["grippers"], scenario.scene.handles.handles, strict=True):
+            away = scenario.scene.mesh.nodes[handle.node] - episode.gripper[0, names.index(name)]
+            assert np.linalg.norm(away[:2]) < 0.02
+
+    def test_three_grippers_are_refused(self):
         episode = recorded(options())
-        twice = np.repeat(episode.gripper, 2, axis=1)
-        with pytest.raises(EpisodeError, match="A hanging cloth may be held by one"):
-            found_layout(replace(episode, gripper=twice, grippers=("left", "right")), cloth_of(episode, (0.30, 0.24)))
+        thrice = np.repeat(episode.gripper, 3, axis=1)
+        with pytest.raises(EpisodeError, match="or by two at the corners of a side"):
+            found_layout(replace(episode, gripper=thrice, grippers=("a", "b", "c")), cloth_of(episode, (0.30, 0.24)))
 
     def test_a_flat_cloth_does_not_hang(self):
         cloud = np.random.default_rng(0).uniform(-0.15, 0.15, (400, 3)) * [1, 1, 0.01]

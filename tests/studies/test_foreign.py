@@ -21,7 +21,7 @@ def lying(height=0.05, shape=(9, 7), size=(0.3, 0.4)):
     """A still level cloth about the place at which cameras look."""
     flat = grid_cloth(*shape, *size)
     nodes = flat.nodes + np.array([0.55, 0.0, height])
-    return study.Moved(np.repeat(nodes[None], 2, 0), flat.faces, nodes[None, -1].repeat(2, 0))
+    return study.Moved(np.repeat(nodes[None], 2, 0), flat.faces, nodes[None, -1:].repeat(2, 0))
 
 
 class TestCloths:
@@ -72,9 +72,9 @@ class TestNewton:
         monkeypatch.setattr(study, "strip", hang)
         monkeypatch.setattr(study.newton, "simulate", simulate)
         cloth = study.Cloth(4)
-        problem, held = study._problem(cloth)
+        problem = study._problem(cloth)
         nodes = 1.05 * problem.mesh.nodes[None].repeat(2, 0)
-        motion = study.Moved(nodes, problem.mesh.faces, nodes[:, held].mean(1))
+        motion = study.Moved(nodes, problem.mesh.faces, nodes[:, cloth.held].mean(2))
         assert study._strain(cloth, motion) == pytest.approx(0.05)
         found = [study.in_a_strip(cloth, motion, tmp_path) for _ in range(2)]
         assert found[0] == found[1]
@@ -109,7 +109,7 @@ class TestClouds:
         cloth = study.Cloth(2)
         alone, under = (
             (study.seen(one, cloth, 2, cut=False).frame(0)[:, 2] < 0.1).sum()
-            for one in (lower, study.Moved(nodes, faces, upper.pad))
+            for one in (lower, study.Moved(nodes, faces, upper.pads))
         )
         assert under < 0.7 * alone
 

@@ -17,12 +17,17 @@ from diffcloud.scene.scenarios.grid import FOLD, LIFT, SHAKE, GridScenario, grid
 from diffcloud.scene.scenarios.hang import HANG, HangScenario, hang_scenario
 from diffcloud.scene.scenarios.recorded import RECORDED
 from diffcloud.scene.scenarios.scenario import Scenario
+from diffcloud.scene.scenarios.surface import MeshScenario, mesh_scenario
 from diffcloud.scene.scenarios.vest import VEST_HANG, VestScenario, vest_scenario
 
-Options = GridScenario | HangScenario | BandScenario | VestScenario
+Options = GridScenario | HangScenario | MeshScenario | BandScenario | VestScenario
 
 _ALL: tuple[Options, ...] = (LIFT, FOLD, BAND_STRETCH, VEST_HANG, SHAKE, HANG, *RECORDED)
 _BUILT_IN: dict[str, Options] = {options.name: options for options in _ALL}
+_MESH = "mesh"
+"""Base of a scenario file that is not built in, because it needs a mesh."""
+_FILES = {"material": (".json",), "mesh": (".obj",)}
+"""Field of a scenario file -> suffixes of the files that it may name."""
 SCENARIO_NAMES = (*_BUILT_IN, *EXPERIMENTS)
 
 
@@ -72,6 +77,8 @@ def make_scenario(options: Options) -> Scenario:
             return grid_scenario(options)
         case HangScenario():
             return hang_scenario(options)
+        case MeshScenario():
+            return mesh_scenario(options)
         case BandScenario():
             return band_scenario(options)
         case VestScenario():
@@ -111,32 +118,43 @@ def read_options(path: Path) -> Options:
     return own_options(data, Path(path).stem, path, folder=Path(path).parent)
 
 
+def with_paths(fields: Mapping[str, object], folder: Path) -> dict[str, object]:
+    """Return the fields of a scenario file with absolute paths of its mesh and material, for use in another folder.
+
+    Args:
+        folder: folder of the scenario file.
+    """
+    files = {
+        name: value for name, value in fields.items() if isinstance(value, str) and value.endswith(_FILES.get(name, ()))
+    }
+    return {**fields, **{name: str((folder / value).resolve()) for name, value in files.items()}}
+
+
 def own_options(fields: Mapping[str, object], name: str, source: object, *, folder: Path) -> Options:
     """Return the options from the fields of a scenario file.
 
     Args:
         name: name of the scenario.
         source: origin of the fields, for messages.
-        folder: folder to which the path of a material is relative.
+        folder: folder to which paths of mesh and material are relative.
 
     Raises:
         SceneError: a field is unknown, or a value is out of range.
     """
     data = dict(fields)
     base = data.pop("base", "lift")
-    if not isinstance(base, str) or base not in _BUILT_IN:
-        raise SceneError(f"{source}: " + unknown_name("base", str(base), _BUILT_IN))
-    material = data.get("material")
-    if isinstance(material, str) and material.endswith(".json"):
-        data["material"] = str((folder / material).resolve())
-    options = _BUILT_IN[base]
-    given = options.model_dump()
+    if base not in (*_BUILT_IN, _MESH):
+        raise SceneError(f"{source}: " + unknown_name("base", str(base), (*_BUILT_IN, _MESH)))
+    data = with_paths(data, folder)
+    options = _BUILT_IN.get(str(base))
+    given = {} if options is None else options.model_dump()
     if "loss_frames" in data:
         given["every_frame"] = False
     for own, other in (("grasped", "grippers"), ("grippers", "grasped")):
         if own in data:
             given.pop(other, None)
+    kind = MeshScenario if options is None else type(options)
     try:
-        return type(options).model_validate({**given, "name": name, **data})
+        return kind.model_validate({**given, "name": name, **data})
     except ValidationError as error:
         raise explain(source, error, SceneError) from error

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import chain
 from typing import Annotated, Literal
 
@@ -16,11 +16,9 @@ from diffcloud.io.schema import Checked, NonNegative
 from diffcloud.mesh.shapes import lined_cloth, rectangle_surface
 from diffcloud.mesh.topology import ClothMesh
 from diffcloud.scene.scenarios.initial_state import parse_initial_state
-from diffcloud.scene.scenarios.options import Coordinate, Keyframes, Length, ScenarioOptions, assemble, chosen_material
+from diffcloud.scene.scenarios.options import Coordinate, Keyframes, Length, Regrip, ScenarioOptions, assemble, sunk
 from diffcloud.scene.scenarios.scenario import Scenario
 from diffcloud.sim.grasp import GRIP_M, Grasp, Grip, inside, turned_up, window
-from diffcloud.sim.integrators import load_integrator
-from diffcloud.sim.surrounding import ContactSettings
 
 Names = tuple[str | int, ...]
 """Grasp points: corners (left/right_bottom/top of the unrotated cloth), or node numbers of the uniform grid."""
@@ -161,7 +159,7 @@ def grid_scenario(options: GridScenario) -> Scenario:
     scenario = assemble(
         options,
         mesh,
-        (rectangle_surface(options.center_m, (extent, extent), options.table_height_m - _sunk(options)),),
+        (rectangle_surface(options.center_m, (extent, extent), options.table_height_m - sunk(options, options.gap_m)),),
         grippers=dict(zip(named, nodes[:-1], strict=True)),
         held=nodes[-1],
         grasp=Grasp(options.grip, options.grip_m),
@@ -169,34 +167,8 @@ def grid_scenario(options: GridScenario) -> Scenario:
         turned=turned,
         loss_faces=_half(mesh, grasped) if options.loss_surface == "grasped_half" else None,
     )
-    regrip = _Regrip(options) if options.grip_known_within > 1 else None
+    regrip = Regrip(grid_scenario, options) if options.grip_known_within > 1 else None
     return replace(scenario, initial_state=parse_initial_state(options.initial_state), regrip=regrip)
-
-
-@dataclass(frozen=True)
-class _Regrip:
-    """Function that returns the scenario with another grasp size."""
-
-    options: GridScenario
-
-    def __call__(self, deviations: float) -> Scenario:
-        """Return the scenario with a grasp this many standard deviations larger.
-
-        Raises:
-            SceneError: the pad is as large as the cloth.
-        """
-        size = self.options.grip_m * self.options.grip_known_within**deviations
-        return grid_scenario(self.options.model_copy(update={"grip_m": size}))
-
-
-def _sunk(options: GridScenario) -> float:
-    """Return how far the contact table is below the real one [m], so that the cloth is initially at rest. The contact
-    model holds a cloth about 2 mm above its table. The mid-surface of a real cloth is at half its thickness."""
-    contact = ContactSettings(options.contact_stiffness, options.contact_thickness_m)
-    weight = -options.gravity[2] * chosen_material(options).density
-    if weight <= 0:
-        return 0.0
-    return max(load_integrator(options.integrator).resting_height(contact, weight) - options.gap_m, 0.0)
 
 
 def _places(options: GridScenario, names: Sequence[str | int]) -> list[int]:

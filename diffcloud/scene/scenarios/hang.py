@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from diffcloud.errors import DivergedError, SceneError
+from diffcloud.io.episodes import ONLY_GRIPPER
 from diffcloud.mesh.shapes import grid_cloth
 from diffcloud.scene.description import Scene
 from diffcloud.scene.scenarios.options import Coordinate, Length, ScenarioOptions, assemble
@@ -46,6 +47,8 @@ class HangScenario(ScenarioOptions):
     """Direction of the held side: rotation about the vertical from the world's x axis."""
     span: Annotated[float, Field(gt=0.3, le=1)] = 1.0
     """Ratio of the distance of the held corners to the length of their side. Below 1, the cloth bows to the left."""
+    grippers: Annotated[tuple[str, ...], Field(min_length=1, max_length=2)] = (ONLY_GRIPPER[0],)
+    """Names of the grippers. Of two, the first holds the corner at the start of the side's direction."""
     grip_m: Length = GRIP_M
     """Size of the grasp at a corner, which lets the cloth rotate."""
     air: Literal["none", "drag", "still"] = "still"
@@ -64,17 +67,20 @@ def hang_scenario(options: HangScenario) -> Scenario:
     """Build the scenario. It starts in the equilibrium of the scenario's material.
 
     Raises:
-        SceneError: a held edge has a span below 1, or the simulation of the settling cloth diverges.
+        SceneError: a held edge has a span below 1, two grippers do not hold corners, or the simulation of the settling
+            cloth diverges.
     """
     if options.held == "edge" and options.span < 1:
         raise SceneError(f"Scenario {options.name}: a held edge is straight, so its span is 1; got {options.span:g}.")
+    if len(options.grippers) > 1 and options.held != "corners":
+        raise SceneError(f"Scenario {options.name}: two grippers hold `corners`, not {options.held}.")
     flat = grid_cloth(*reversed(options.nodes), *reversed(options.size_m))
     held = _held(options)
     scenario = assemble(
         options,
         replace(flat, nodes=_unfolded(options, flat.verts)),
         (),
-        grippers={"gripper": held},
+        grippers={name: [*held[number :: len(options.grippers)]] for number, name in enumerate(options.grippers)},
         grasp=None if options.held == "edge" else Grasp("pivot", options.grip_m),
     )
     try:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,16 +40,23 @@ _A_CELL = 8
 """Number of points per grid cell in the first frame, so that a covered cell has points in later frames too."""
 _FEW_CELLS = 20
 """Minimum number of cells that must leave the table to separate cloth from table. Fewer may change by chance."""
+_RECTANGLE = 0.85
+"""Minimum fraction of the rectangle around a cloth that its cloud covers. Towels have 0.95 to 1, also under a hand, shirts
+and vests 0.74 to 0.82."""
+_COVERED = 0.4
+"""Number of points of a covered cell, as a fraction of the median."""
+HAND_M = 0.12
+"""Distance from a gripper within which a hand may hide the cloth."""
 _STAYS = 0.5
 """Minimum fraction of the expected lifted area that has really left the table, if the cloud is a cloth."""
 _AT_CORNER_M = 0.03
 _TRAVEL_M = 0.03
 _NODES = (5, 13)
-_GAP_M: float = GridScenario.model_fields["gap_m"].default
+GAP_M: float = GridScenario.model_fields["gap_m"].default
 """Initial height of the cloth above the table."""
 _FEW_POINTS = 100
-FIELDS = ("center_m", "yaw_deg", "initial_state", "table_height_m", "grasped", "rate_hz", "frames", "path")
-"""Scenario fields that `find_layout` estimates."""
+FIELDS = ("center_m", "yaw_deg", "initial_state", "table_height_m", "rate_hz", "frames", "path")
+"""Scenario fields that `find_layout` estimates, beside `grasped` or `grippers`."""
 
 
 @dataclass(frozen=True)
@@ -69,7 +77,7 @@ class Layout:
 
 def found_size(episode: Episode) -> tuple[float, float]:
     """Return the sides of the cloth in the first frame, the longer one first [m]."""
-    sides = _rectangle(_flat_cloud(episode))[1]
+    sides = _rectangle(flat_cloud(episode))[1]
     return max(sides), min(sides)
 
 
@@ -83,7 +91,7 @@ def find_layout(episode: Episode, size: tuple[float, float], pad: float = GRIP_M
     """Estimate the fields of a grid scenario from a recording.
 
     Args:
-        episode: recording in metres, z up, with the track of one gripper.
+        episode: recording in metres, z up, with the tracks of its grippers.
         size: sides of the cloth [m].
         pad: side of the gripper's pad [m]; 0: a point.
 
@@ -91,17 +99,12 @@ def find_layout(episode: Episode, size: tuple[float, float], pad: float = GRIP_M
         EpisodeError: there is no gripper track, the unit is wrong, the first cloud is not flat and level or contains
             the table, the stated size does not fit the cloud, or the gripper is not at the cloth. Says what to try.
     """
-    if episode.gripper is None:
-        raise EpisodeError("The recording has no track of its gripper: put a gripper.csv (t_s, x, y, z) beside the clouds.")
-    if len(episode.grippers) > 1:
-        raise EpisodeError(
-            f"The recording has the grippers {', '.join(episode.grippers)}; this takes one. Write a scenario with "
-            "`grippers` and use `diffcloud fit`."
-        )
-    warnings = _few_points(episode)
-    cloud = _flat_cloud(episode)
+    refuse_no_track(episode)
+    assert episode.gripper is not None
+    warnings = few_points(episode)
+    cloud = flat_cloud(episode)
     yaw, sides, centre = _rectangle(cloud)
-    _refuse_table(episode, cloud, sides)
+    refuse_table(episode, cloud, sides)
     if (sides[0] < sides[1]) != (size[0] < size[1]):  # match the longer sides
         yaw, sides = yaw + math.pi / 2, (sides[1], sides[0])
     off = max(abs(side / stated - 1) for side, stated in zip(sides, size, strict=True))
@@ -113,62 +116,112 @@ def find_layout(episode: Episode, size: tuple[float, float], pad: float = GRIP_M
         )
     if off > _SIZE_OFF / 2:
         warnings.append(f"the first frame shows {sides[0]:.3f} x {sides[1]:.3f} m, {off:.0%} off the stated size")
-    gripper = episode.gripper[:, 0]
+    _refuse_other_outline(episode, cloud, yaw, sides, centre)
     turn = _turned(yaw)
-    local = (gripper[0, :2] - centre) @ turn
+    local = (episode.gripper[0, :, :2] - centre) @ turn
     half = np.array(size) / 2
-    beyond = float(np.linalg.norm(np.maximum(np.abs(local) - half, 0.0)))
-    if beyond > 0.5 * max(size):
-        raise EpisodeError(
-            f"The gripper's first position lies {beyond:.2f} m beside the cloth. Clouds and gripper must be in one frame "
-            "(the robot's base, metres, z up), and the track must begin where the cloth is grasped."
-        )
+    for name, beyond in zip(episode.grippers, np.linalg.norm(np.maximum(np.abs(local) - half, 0.0), axis=1), strict=True):
+        refuse_beside(float(beyond), max(size), called(name, episode))
     columns, rows = node_counts(size)
     across, along = np.meshgrid(np.linspace(-half[0], half[0], columns), np.linspace(-half[1], half[1], rows))
     nodes = np.stack([across.ravel(), along.ravel()], axis=-1)
     # a rectangle is symmetric under half a turn, so choose the yaw with the grasped corner at the top right
-    if local[0] < 0 and local[1] < 0:
+    if local[0, 0] < 0 and local[0, 1] < 0:
         yaw, local = yaw + math.pi, -local
     inner = np.maximum(half - pad / 2, 0.0)  # a pad at an edge is inside the cloth
-    distances = np.linalg.norm(np.clip(nodes, -inner, inner) - local, axis=1)
-    node = int(distances.argmin())
-    if distances[node] > 0.5 * max(size) / (_NODES[1] - 1) + _AT_CORNER_M:
-        warnings.append(f"the gripper begins {1e3 * distances[node]:.0f} mm beside the nearest place of a grasp")
+    distances = np.linalg.norm(np.clip(nodes, -inner, inner) - local[:, None], axis=2)
+    held, away = distances.argmin(axis=1).tolist(), distances.min(axis=1)
+    for name, distance in zip(episode.grippers, away, strict=True):
+        if distance > 0.5 * max(size) / (_NODES[1] - 1) + _AT_CORNER_M:
+            warnings.append(f"{called(name, episode)} begins {1e3 * distance:.0f} mm beside the nearest place of a grasp")
     corners = {
         0: "left_bottom",
         columns - 1: "right_bottom",
         rows * columns - columns: "left_top",
         len(nodes) - 1: "right_top",
     }
-    travel = float(np.ptp(gripper, axis=0).max())
-    if travel < _TRAVEL_M:
-        warnings.append(f"the gripper moves by {1e3 * travel:.0f} mm: such a motion shows little")
-    table = float(np.median(cloud[:, 2])) - _GAP_M
-    interval = float(np.median(np.diff(episode.times))) if len(episode.times) > 1 else 0.1
-    frames = max(round(float(episode.times[-1]) / interval), 1)
+    course, told = flat_course(episode)
+    table = float(np.median(cloud[:, 2])) - GAP_M
+    reason = f"where a grasp is nearest the gripper's first position, {1e3 * away[0]:.0f} mm away"
+    grasped: dict[str, Any] = {"grasped": Found([corners.get(held[0], held[0])], reason)}
+    if len(held) > 1:
+        if len(set(held)) < len(held):
+            raise EpisodeError(
+                f"Two of the grippers {', '.join(episode.grippers)} begin at the same place of the cloth. Each gripper "
+                "holds a part of its own. Check the tracks, or leave one out."
+            )
+        paths = own_paths(episode)
+        grippers = {
+            name: {"grasped": [corners.get(node, node)], "path": paths[name]}
+            for name, node in zip(episode.grippers, held, strict=True)
+        }
+        told_away = ", ".join(f"{1e3 * one:.0f}" for one in away)
+        grasped = {"grippers": Found(grippers, f"where a grasp is nearest each first position, {told_away} mm away")}
     found = {
         "center_m": Found([round(float(part), 4) for part in centre], "middle of the rectangle around the first frame"),
         "yaw_deg": Found(round(math.degrees(yaw) % 360, 2), "turn at which that rectangle is smallest"),
         "initial_state": Found("none", "the first frame shows the turn; with turn=5deg, a fit finds how far it is off"),
-        "table_height_m": Found(round(table, 5), f"{1e3 * _GAP_M:.1g} mm below the middle height of the first frame"),
-        "grasped": Found(
-            [corners.get(node, node)],
-            f"where a grasp is nearest the gripper's first position, {1e3 * distances[node]:.0f} mm away",
-        ),
+        "table_height_m": Found(round(table, 5), f"{1e3 * GAP_M:.1g} mm below the middle height of the first frame"),
+        **grasped,
+        **course,
+    }
+    return Layout(found, (*warnings, *told))
+
+
+def flat_course(episode: Episode) -> tuple[dict[str, Found], list[str]]:
+    """Return the scenario fields of time and path of a recording that begins on a table, and warnings."""
+    assert episode.gripper is not None
+    warnings = list[str]()
+    for number, name in enumerate(episode.grippers):
+        travel = float(np.ptp(episode.gripper[:, number], axis=0).max())
+        if travel < _TRAVEL_M:
+            warnings.append(f"{called(name, episode)} moves by {1e3 * travel:.0f} mm: such a motion shows little")
+    interval = float(np.median(np.diff(episode.times))) if len(episode.times) > 1 else 0.1
+    return {
         "rate_hz": Found(round(1 / interval, 6), f"frames are {interval:.4f} s apart"),
-        "frames": Found(frames, f"the recording ends at {episode.times[-1]:.3f} s"),
+        "frames": Found(
+            max(round(float(episode.times[-1]) / interval), 1), f"the recording ends at {episode.times[-1]:.3f} s"
+        ),
         "path": Found(
-            [
-                [0.0, 0.0, 0.0, 0.0],
-                [float(episode.times[-1]) or 1.0, *(round(float(x), 4) for x in gripper[-1] - gripper[0])],
-            ],
+            next(iter(own_paths(episode).values())),
             "first and last position of the gripper; fits follow its recorded track",
         ),
+    }, warnings
+
+
+def own_paths(episode: Episode) -> dict[str, list[list[float]]]:
+    """Return the path of each gripper from its first to its last position, as keyframes (time s, dx, dy, dz m)."""
+    assert episode.gripper is not None
+    return {
+        name: [
+            [0.0, 0.0, 0.0, 0.0],
+            [float(episode.times[-1]) or 1.0, *(round(float(x), 4) for x in track[-1] - track[0])],
+        ]
+        for name, track in zip(episode.grippers, episode.gripper.swapaxes(0, 1), strict=True)
     }
-    return Layout(found, tuple(warnings))
 
 
-def _refuse_table(episode: Episode, cloud: NDArray[np.float64], sides: tuple[float, float]) -> None:
+def refuse_no_track(episode: Episode) -> None:
+    """Refuse a recording without the track of a gripper."""
+    if episode.gripper is None:
+        raise EpisodeError("The recording has no track of its gripper: put a gripper.csv (t_s, x, y, z) beside the clouds.")
+
+
+def refuse_beside(beyond: float, extent: float, name: str) -> None:
+    """Refuse a gripper that begins `beyond` [m] beside a cloth of this extent [m]."""
+    if beyond > 0.5 * extent:
+        raise EpisodeError(
+            f"The first position of {name} lies {beyond:.2f} m beside the cloth. Clouds and gripper must be in one frame "
+            "(the robot's base, metres, z up), and the track must begin where the cloth is grasped."
+        )
+
+
+def called(name: str, episode: Episode) -> str:
+    """Return how messages call a gripper."""
+    return "the gripper" if len(episode.grippers) == 1 else f"the gripper {name}"
+
+
+def refuse_table(episode: Episode, cloud: NDArray[np.float64], sides: tuple[float, float]) -> None:
     """Check that the cloud does not contain the table, by the points that remain low when the gripper is highest.
 
     A cloth is lifted around the grasped point about as far as the gripper rises; otherwise it would be stretched. Table
@@ -178,7 +231,7 @@ def _refuse_table(episode: Episode, cloud: NDArray[np.float64], sides: tuple[flo
         EpisodeError: more points remain than a cloth could leave.
     """
     assert episode.gripper is not None
-    rise = episode.gripper[:, 0, 2] - episode.gripper[0, 0, 2]
+    rise = (episode.gripper[:, :, 2] - episode.gripper[0, :, 2]).max(axis=1)
     top = int(rise.argmax())
     area = sides[0] * sides[1]
     cell = math.sqrt(area * _A_CELL / len(cloud))
@@ -197,7 +250,40 @@ def _refuse_table(episode: Episode, cloud: NDArray[np.float64], sides: tuple[flo
         )
 
 
-def _few_points(episode: Episode) -> list[str]:
+def _refuse_other_outline(
+    episode: Episode, cloud: NDArray[np.float64], yaw: float, sides: tuple[float, float], centre: NDArray[np.float64]
+) -> None:
+    """Check that a cloud covers the rectangle around it, except near grippers, where a hand may hide it.
+
+    Raises:
+        EpisodeError: it does not.
+    """
+    assert episode.gripper is not None
+    count = np.maximum(np.round(np.array(sides) / math.sqrt(sides[0] * sides[1] * _A_CELL / len(cloud))), 1).astype(int)
+    cell = np.clip(np.floor(((cloud[:, :2] - centre) @ _turned(yaw) / sides + 0.5) * count), 0, count - 1).astype(int)
+    points = np.bincount(cell @ [count[1], 1], minlength=int(count.prod()))
+    middle = (np.stack(np.divmod(np.arange(count.prod()), count[1]), axis=1) + 0.5) / count - 0.5
+    local = (episode.gripper[0, :, :2] - centre) @ _turned(yaw)
+    seen = (np.linalg.norm(middle * sides - local[:, None], axis=2) > HAND_M).all(axis=0)
+    if seen.sum() < _FEW_CELLS:
+        return
+    part = float((points[seen] >= _COVERED * np.median(points[points > 0])).mean())
+    if part < _RECTANGLE:
+        raise EpisodeError(
+            f"More than {100 * HAND_M:.0f} cm from grippers, the first frame covers {part:.0%} of the rectangle around it; "
+            f"a rectangular cloth covers at least {_RECTANGLE:.0%}. State the shape of another cloth by --mesh. Of a "
+            "rectangle, show the whole cloth in the first frame."
+        )
+
+
+def covered_area(cloud: NDArray[np.float64]) -> float:
+    """Return the area [m²] of the cells that a flat cloud [N, 3] covers, seen from above."""
+    low, high = np.quantile(cloud[:, :2], [_RIM, 1 - _RIM], axis=0)
+    cell = math.sqrt(float(np.prod(high - low)) * _A_CELL / len(cloud))
+    return cell**2 * len(np.unique(np.floor(cloud[:, :2] / cell), axis=0))
+
+
+def few_points(episode: Episode) -> list[str]:
     counts = np.diff(episode.offsets)
     thin = np.flatnonzero(counts < _FEW_POINTS)
     if not len(thin):
@@ -205,7 +291,7 @@ def _few_points(episode: Episode) -> list[str]:
     return [f"frames {', '.join(map(str, thin[:5]))} have fewer than {_FEW_POINTS} points (as few as {counts[thin].min()})"]
 
 
-def _flat_cloud(episode: Episode) -> NDArray[np.float64]:
+def flat_cloud(episode: Episode) -> NDArray[np.float64]:
     """Return the points [N, 3] of the first frame without stray points.
 
     Raises:

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -102,6 +102,37 @@ class ScenarioOptions(Checked):
     def own_paths(self) -> Mapping[str, Keyframes]:
         """Path of each gripper that does not follow `path`."""
         return {}
+
+
+@dataclass(frozen=True)
+class Regrip:
+    """Function that returns a scenario with another grasp size."""
+
+    build: Callable[[Any], Scenario]
+    options: Any
+    """Options with `grip_m` and `grip_known_within`, which `build` takes."""
+
+    def __call__(self, deviations: float) -> Scenario:
+        """Return the scenario with a grasp this many standard deviations larger.
+
+        Raises:
+            SceneError: the pad is as large as the cloth.
+        """
+        size = self.options.grip_m * self.options.grip_known_within**deviations
+        return self.build(self.options.model_copy(update={"grip_m": size}))
+
+
+def resting_height(options: ScenarioOptions) -> float:
+    """Return the height above a level table at which the contact model holds a cloth, about 2 mm; 0 without weight [m]."""
+    contact = ContactSettings(options.contact_stiffness, options.contact_thickness_m)
+    weight = -options.gravity[2] * chosen_material(options).density
+    return load_integrator(options.integrator).resting_height(contact, weight) if weight > 0 else 0.0
+
+
+def sunk(options: ScenarioOptions, gap_m: float) -> float:
+    """Return how far the contact table is below the real one [m], so that a cloth at height `gap_m` is initially at rest.
+    The mid-surface of a real cloth is at half its thickness, below the height at which the contact model holds it."""
+    return max(resting_height(options) - gap_m, 0.0)
 
 
 def chosen_material(options: ScenarioOptions) -> Material:

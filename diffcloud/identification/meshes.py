@@ -1,0 +1,290 @@
+"""Search for the initial state of a recorded cloth of any shape, given as a triangle mesh.
+
+On a table, the mesh is placed with either face up, in 24 directions, and aligned with the first cloud. From one gripper, it
+is hung by the points of its outline that fit the height of the cloud. The hypothesis with the smallest RMS distance is
+chosen.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import dijkstra
+from scipy.spatial import cKDTree
+
+from diffcloud.errors import EpisodeError, SceneError
+from diffcloud.identification.hanging import (
+    CAP_M,
+    WORST_M,
+    aligned,
+    both_ways,
+    first_cloud,
+    hanging_course,
+    on_surface,
+    refuse_far,
+)
+from diffcloud.io.episodes import Episode
+from diffcloud.mesh.simplified import lines
+from diffcloud.mesh.topology import SurfaceMesh, directed_edges
+from diffcloud.scene.scenarios.catalogue import own_options
+from diffcloud.scene.scenarios.layout import (
+    GAP_M,
+    HAND_M,
+    Found,
+    Layout,
+    called,
+    covered_area,
+    few_points,
+    flat_cloud,
+    flat_course,
+    own_paths,
+    refuse_beside,
+    refuse_table,
+)
+from diffcloud.scene.scenarios.surface import MeshScenario, flat_points, level_frame, mesh_scenario, read_mesh
+
+Floats = NDArray[np.float64]
+
+MESH_FIELDS = {
+    "flat": ("up", "center_m", "yaw_deg", "table_height_m", "grippers", "rate_hz", "frames", "path"),
+    "hang": ("yaw_deg", "grippers", "rate_hz", "frames", "steps_per_frame", "path"),
+}
+"""Start -> scenario fields that `find_mesh` determines."""
+_TURNS = 24
+_STAGES = ((300, 10, 2 * _TURNS), (1500, 30, 6))
+"""Numbers of cloud points, iterations and hypotheses in both stages of the alignment."""
+_FINISHED_M = 1e-5
+_DAMPING = 0.02
+"""Regularisation of a Gauss-Newton step, as a fraction of the number of points."""
+_BESIDE_M = 0.03
+_TOLD = 4
+"""Number of hypotheses that messages list."""
+_COARSE, _HUNG = 100, 16
+"""Number of nodes of the mesh that is hung, and of the points by which it is hung."""
+_HUNG_TURNS = 8
+_CLEAR, _ELSEWHERE_M = 1.5, 0.06
+"""Factor of the RMS distance up to which a grasp elsewhere is as likely, and its distance [m]."""
+_REACH = (0.9, 1.5)
+"""Longest way along the mesh from the held point, relative to the height of the cloud. Folds shorten the cloud."""
+
+
+def find_mesh(episode: Episode, cloth: Mapping[str, Any]) -> Layout:
+    """Determine where and how the cloth of a mesh begins a recording.
+
+    Args:
+        episode: recording in metres, z up, with the tracks of its grippers.
+        cloth: fields of a `mesh` scenario that all recordings share, such as the mesh and the material.
+
+    Raises:
+        EpisodeError: no hypothesis is within 25 mm of the first cloud, or a gripper is not at the cloth. The message has
+            the distances.
+        MeshError: the mesh cannot be a cloth.
+    """
+    return (_hanging if cloth["start"] == "hang" else _flat)(episode, cloth)
+
+
+def _flat(episode: Episode, cloth: Mapping[str, Any]) -> Layout:
+    assert episode.gripper is not None
+    surface = read_mesh(Path(cloth["mesh"]), int(cloth["nodes"]))
+    frame = level_frame(surface.nodes, surface.faces)
+    warnings = few_points(episode)
+    whole = flat_cloud(episode)
+    height = float(np.median(whole[:, 2]))
+    hands = episode.gripper[0] * [1, 1, 0]
+    flats = {up: flat_points(surface.nodes, frame, up, 0.0) * [1, 1, 0] for up in ("front", "back")}
+    tried = [(0.0, up, yaw, np.median(whole, axis=0)) for up in flats for yaw in np.linspace(0, 2 * np.pi, _TURNS + 1)[1:]]
+    for points, steps, kept in _STAGES:
+        cloud = whole[:: max(len(whole) // points, 1)] * [1, 1, 0]
+        results = (
+            _aligned_flat(flats[up], surface.faces, cloud, hands, place, yaw, steps) for _, up, yaw, place in tried[:kept]
+        )
+        tried = sorted(
+            ((rms, up, turned, place) for (rms, place, turned), (_, up, _, _) in zip(results, tried, strict=False)),
+            key=lambda one: one[0],
+        )
+    rms, up, yaw, place = tried[0]
+    centre = place[:2]
+    listed = _distinct([(rms, f"{up} up, {math.degrees(yaw) % 360:.0f} degrees") for rms, up, yaw, _ in tried])
+    _refuse_other(rms, listed, cloth["mesh"])
+    flat = flat_points(surface.nodes, frame, up, yaw)
+    refuse_table(episode, whole, (math.sqrt(covered_area(whole)),) * 2)
+    extent = float(np.ptp(surface.nodes, axis=0).max())
+    grippers = dict[str, Any]()
+    for number, name in enumerate(episode.grippers):
+        first = np.array([*(episode.gripper[0, number, :2] - centre), 0.0])
+        beside = float(np.linalg.norm(on_surface(first[None], flat * [1, 1, 0], surface.faces)[0] - first))
+        refuse_beside(beside, extent, called(name, episode))
+        if beside > _BESIDE_M:
+            warnings.append(f"{called(name, episode)} begins {1e3 * beside:.0f} mm beside the cloth")
+        grippers[name] = {"on_mesh_m": _rounded(_on_mesh(first, frame, up, yaw))}
+    for name, path in own_paths(episode).items():
+        grippers[name]["path"] = path
+    course, told = flat_course(episode)
+    found = {
+        "up": Found(up, f"nearest to the first cloud: {listed}"),
+        "center_m": Found(_rounded(centre), "where the centre of the mesh's area lies"),
+        "yaw_deg": Found(round(math.degrees(yaw) % 360, 2), "direction in which the mesh is nearest to the first cloud"),
+        "table_height_m": Found(
+            round(height - GAP_M, 5), f"{1e3 * GAP_M:.1g} mm below the middle height of the first frame"
+        ),
+        "grippers": Found(grippers, "what each gripper holds: the point of the mesh at its first position"),
+        **course,
+    }
+    return Layout(found, (*warnings, *told))
+
+
+def _aligned_flat(
+    flat: Floats, faces: NDArray[np.int64], cloud: Floats, hands: Floats, place: Floats, yaw: float, steps: int
+) -> tuple[float, Floats, float]:
+    """Align a flat mesh with a cloud, both at height 0, by translation and rotation.
+
+    Points of the mesh do not count if a point of the cloud is as near as its spacing, or if a hand may hide them. So only
+    the outline aligns.
+
+    Args:
+        hands: [G, 3] places of the grippers.
+        place, yaw: where the iteration begins: [3] of the mesh's origin, and its rotation [rad].
+
+    Returns:
+        The RMS distance [m], place and yaw.
+    """
+    tree = cKDTree(cloud)
+    spacing = 2 * float(np.median(tree.query(cloud, k=4)[0][:, -1]))
+    own = np.concatenate([flat, flat[faces].mean(axis=1)])
+    centre = place * [1, 1, 0]
+    for _ in range(steps):
+        cosine, sine = math.cos(yaw), math.sin(yaw)
+        turn = np.array([[cosine, sine, 0], [-sine, cosine, 0], [0, 0, 1]])
+        local = (cloud - centre) @ turn.T
+        outside = (local - on_surface(local, flat, faces)) @ turn
+        placed = own @ turn
+        far, index = tree.query(placed + centre)
+        hidden = (np.linalg.norm(placed + centre - hands[:, None], axis=2) < HAND_M).any(axis=0)
+        uncovered = np.where((far > spacing)[:, None] & ~hidden[:, None], cloud[index] - placed - centre, 0.0)
+        normal, pull = np.zeros((3, 3)), np.zeros(3)
+        for arms, ways in ((cloud - centre, outside), (placed, uncovered)):
+            length = np.linalg.norm(ways, axis=1)
+            active = (length > 1e-9) & (length < 2 * CAP_M)
+            x, y = arms[active, 0], arms[active, 1]
+            rows = np.stack([np.stack([np.ones_like(x), 0 * x, -y], 1), np.stack([0 * x, np.ones_like(x), x], 1)], 1)
+            normal += np.einsum("nki,nkj->ij", rows, rows) / len(arms)
+            pull += np.einsum("nki,nk->i", rows, ways[active, :2]) / len(arms)
+        size = float((own[:, :2] ** 2).sum(axis=1).mean())
+        step = np.linalg.solve(normal + _DAMPING * np.diag([1.0, 1.0, size]), pull)
+        centre[:2] += step[:2]
+        yaw += float(step[2])
+        if np.abs(step[:2]).max() < _FINISHED_M and abs(step[2]) * math.sqrt(size) < _FINISHED_M:
+            break
+    cosine, sine = math.cos(yaw), math.sin(yaw)
+    turn = np.array([[cosine, sine, 0], [-sine, cosine, 0], [0, 0, 1]])
+    return both_ways(cloud, flat @ turn + centre, faces), centre, yaw
+
+
+def _on_mesh(point: Floats, frame: tuple[Floats, Floats], up: str, yaw: float) -> Floats:
+    """Return the coordinates [3] in the mesh file of a point about the flat mesh's origin."""
+    rotation, centre = frame
+    cosine, sine = math.cos(yaw), math.sin(yaw)
+    flat = point @ np.array([[cosine, -sine, 0], [sine, cosine, 0], [0, 0, 1]])
+    if up == "back":
+        flat = flat * [1, -1, -1]
+    return np.asarray(flat @ rotation + centre)
+
+
+def _hanging(episode: Episode, cloth: Mapping[str, Any]) -> Layout:
+    assert episode.gripper is not None
+    if len(episode.grippers) > 1:
+        raise EpisodeError(
+            f"The cloth hangs at the start, and the recording has the grippers {', '.join(episode.grippers)}. A mesh that "
+            "hangs may be held by one. Begin the recording on a table, or state the scene in a file with `base: mesh`."
+        )
+    (name,) = episode.grippers
+    cloud, gripper = first_cloud(episode), episode.gripper[:, 0]
+    course = hanging_course(episode)
+    fields = {**cloth, **{key: one.value for key, one in course.items()}}
+    surface = read_mesh(Path(cloth["mesh"]), _COARSE)
+    top = cloud[cloud[:, 2].argsort()[-max(len(cloud) // 100, 1) :]].mean(axis=0)
+    tried = list[tuple[float, Floats, float, Floats]]()
+
+    def hang(points: Sequence[Floats], nodes: int) -> None:
+        for point in points:
+            hold = {name: {"on_mesh_m": point.tolist(), "at_m": top.tolist()}}
+            options = own_options({**fields, "nodes": nodes, "grippers": hold}, "mesh", "the cloth", folder=Path())
+            assert isinstance(options, MeshScenario)
+            try:
+                mesh = mesh_scenario(options).scene.mesh
+            except SceneError:  # it does not come to rest
+                continue
+            for angle in 2 * np.pi * np.arange(_HUNG_TURNS) / _HUNG_TURNS:
+                cosine, sine = math.cos(angle), math.sin(angle)
+                turn = np.array([[cosine, sine, 0.0], [-sine, cosine, 0.0], [0.0, 0.0, 1.0]])
+                at, turned, rms = aligned((mesh.nodes - top) @ turn + top, mesh.faces, top, cloud)
+                tried.append((rms, at, float(angle) + turned, point))
+        tried.sort(key=lambda one: one[0])
+
+    hang(_grasps(surface, float(np.ptp(np.quantile(cloud[:, 2], [0.005, 0.995])))), _COARSE)
+    if tried:
+        near = np.linalg.norm(surface.nodes - tried[0][3], axis=1).argsort()
+        hang([surface.nodes[node] for node in near[1:4]], _COARSE)
+        hang([tried[0][3]], int(cloth["nodes"]))
+    listed = _distinct([(rms, f"by {_rounded(point)}") for rms, _, _, point in tried])
+    _refuse_other(tried[0][0] if tried else math.inf, listed, cloth["mesh"])
+    _, at, yaw, point = tried[0]
+    found = {
+        "yaw_deg": Found(round(math.degrees(yaw) % 360, 2), "where the settled cloth is nearest to the first cloud"),
+        "grippers": Found(
+            {name: {"on_mesh_m": _rounded(point), "at_m": _rounded(at)}},
+            f"point of the mesh that is held, and its place; nearest to the first cloud: {listed}",
+        ),
+        **course,
+    }
+    others = [
+        rms for rms, _, _, other in tried if np.linalg.norm(other - point) > _ELSEWHERE_M and rms < _CLEAR * tried[0][0]
+    ]
+    unclear = [
+        f"the first cloud does not show clearly by which point the cloth hangs ({listed}); correct on_mesh_m"
+    ] * bool(others)
+    return Layout(found, (*unclear, *refuse_far(at, gripper[0])))
+
+
+def _grasps(surface: SurfaceMesh, height: float) -> list[Floats]:
+    """Return points of the outline from which the mesh reaches about as far down as the cloud is high."""
+    edges, _ = directed_edges(surface.faces)
+    lengths = np.linalg.norm(surface.nodes[edges[:, 0]] - surface.nodes[edges[:, 1]], axis=1)
+    graph = coo_array((lengths, edges.T), shape=(len(surface.nodes),) * 2).tocsr()
+    rim = np.unique(lines(surface))
+    reach = dijkstra(graph, directed=False, indices=rim).max(axis=1)
+    places = surface.nodes[rim[(reach > _REACH[0] * height) & (reach < _REACH[1] * height)]]
+    chosen = list[Floats]()
+    away = np.ones(len(places))
+    while len(chosen) < min(_HUNG, len(places)):  # spread over the outline
+        chosen.append(places[away.argmax()])
+        away = np.minimum(away, np.linalg.norm(places - chosen[-1], axis=1))
+    return chosen
+
+
+def _refuse_other(rms: float, listed: str, mesh: str) -> None:
+    """Refuse a cloud that the mesh does not fit."""
+    if rms > WORST_M:
+        raise EpisodeError(
+            f"The first cloud is not that of the cloth {mesh}. RMS distances of the nearest hypotheses: {listed}; at most "
+            f"{1e3 * WORST_M:.0f} mm are allowed. Check that mesh and clouds are in metres, that the cloud shows the whole "
+            "cloth and nothing else, and that the cloth lies flat or hangs from the gripper."
+        )
+
+
+def _distinct(scored: Sequence[tuple[float, str]]) -> str:
+    """List the first few distinct hypotheses, sorted by their RMS distances."""
+    words = dict[str, float]()
+    for rms, name in scored:
+        words.setdefault(name, rms)
+    return "; ".join(f"{name} {1e3 * rms:.0f} mm" for name, rms in list(words.items())[:_TOLD]) or "none comes to rest"
+
+
+def _rounded(point: Floats) -> list[float]:
+    return [round(float(x), 4) for x in point]
