@@ -36,8 +36,8 @@ def import_(
     gripper: Annotated[
         list[str] | None,
         typer.Option(
-            help="Clouds: CSV with x, y, z in metres and optionally t_s, one row a frame. Of several grippers: one with a "
-            "column gripper that names them, or NAME=PATH, repeated."
+            help="Clouds: CSV with x, y, z in metres and optionally t_s, one row a frame. Several grippers: one CSV with a "
+            "column gripper, or NAME=PATH for each."
         ),
     ] = None,
     rate_hz: Annotated[
@@ -50,13 +50,13 @@ def import_(
     camera: Annotated[
         list[str] | None,
         typer.Option(
-            help="Clouds, also of ROS: NAME=X,Y,Z in metres, in the frame of the clouds, for every camera. Fits leave out "
-            "what none of them could see."
+            help="Clouds, also of ROS: NAME=X,Y,Z in metres, in the frame of the clouds, for every camera. Fits omit "
+            "parts that no camera could see."
         ),
     ] = None,
     label: Annotated[
         list[str] | None,
-        typer.Option(help="KEY=VALUE, kept in the episode, such as scenario=lift or fabric=tan; repeated."),
+        typer.Option(help="KEY=VALUE, stored in the episode, such as scenario=lift or fabric=tan. May be repeated."),
     ] = None,
     joint_log: Annotated[
         Path | None, typer.Option(help="Recordings: CSV of the joints, with the columns of robot.csv.")
@@ -81,7 +81,7 @@ def import_(
     urdf: Annotated[
         Path | None,
         typer.Option(
-            help="ROS without joint_states: the robot, whose link frames are in tf. Default: a Kinova Gen3 with a 2F-85."
+            help="ROS without joint_states: URDF of the robot. Its links are in tf. Default: a Kinova Gen3 with a 2F-85."
         ),
     ] = None,
     trajectories: Annotated[
@@ -95,7 +95,7 @@ def import_(
 ) -> None:
     """Import clouds, recordings or the published data. The kind of the source is detected.
 
-    Clouds become an episode, which fits take. Depth recordings become a raw episode: check it with `diffcloud data
+    Clouds become an episode, the input of a fit. Depth recordings become a raw episode: check it with `diffcloud data
     check`. An option that does not belong to the source's kind is refused.
     """
     from diffcloud.hardware.realsense import play_recordings

@@ -1,4 +1,4 @@
-"""`diffcloud network train`: teach networks to tell the parameters from clouds."""
+"""`diffcloud network train`: train networks to predict the parameters from clouds."""
 
 from __future__ import annotations
 
@@ -19,12 +19,15 @@ _INTERRUPTED = 130
 @settings_options(TrainSettings, everyday=("models", "profile", "epochs", "seed", "device"), advanced=())
 def train(
     data: Annotated[
-        Path, typer.Option(help="Folder written by `diffcloud network generate`; without a scene, of <scenario>/.")
+        Path,
+        typer.Option(
+            help="Folder written by `diffcloud network generate`. Without --scene: folder of such folders, one per scene."
+        ),
     ],
     out: Annotated[
         Path,
         typer.Option(
-            help="Folder; <model>.safetensors, and <model>/ of curves and errors, without a scene in <scenario>/."
+            help="Folder for <model>.safetensors, and <model>/ with curves and errors. Without --scene: in <scenario>/."
         ),
     ],
     settings: Mapping[str, Any],
@@ -37,16 +40,17 @@ def train(
         int,
         typer.Option(
             min=0,
-            help="Processes that sample clouds, on the CPU. 0: the training process does, on the GPU if it trains there.",
+            help="Number of CPU processes that sample clouds. 0: the training process samples them, on the GPU if it "
+            "trains there.",
         ),
     ] = 0,
     workers: Workers = None,
     params: ParamsFile = None,
     json: JsonFlag = False,
 ) -> None:
-    """Train networks. After Ctrl-C or a kill the same command keeps finished ones and goes on from the last saved epoch.
+    """Train networks. After Ctrl-C or a kill, the same command keeps finished networks and resumes at the last saved epoch.
 
-    Other hyper-parameters stand in the section `train` of --params.
+    The section `train` of the file for --params has the other hyper-parameters.
     """
     from rich.table import Table
 

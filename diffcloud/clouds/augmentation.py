@@ -68,12 +68,12 @@ class Augmentation:
 
     @staticmethod
     def none() -> Augmentation:
-        """No augmentation, except for the choice of the loss's faces."""
+        """Return settings without augmentation. Only the faces of the loss are sampled."""
         return Augmentation(keep=(1.0, 1.0), jitter_m=0.0)
 
     @staticmethod
     def recorded(viewpoints: tuple[tuple[float, float, float], ...]) -> Augmentation:
-        """What several depth cameras together see of a cloth that was placed by hand."""
+        """Return settings for the clouds of several depth cameras that see a cloth placed by hand."""
         return Augmentation((1.0, 1.0), jitter_m=_CAMERAS_M, loss_faces_only=False, viewpoints=viewpoints, shift_m=_PLACE_M)
 
 

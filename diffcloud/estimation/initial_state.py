@@ -76,7 +76,7 @@ def variables_of(described: Sequence[Mapping[str, NuisanceValue]], *, length_uni
     for name in (name for one in every for name in one):
         if not is_initial_state(name):
             raise ConfigError(
-                unknown_name("variable of how a cloth lies", name, [*filter(is_initial_state, INITIAL_STATE), *_SHAPES])
+                unknown_name("initial-state variable", name, [*filter(is_initial_state, INITIAL_STATE), *_SHAPES])
             )
     return _variables(every, length_unit_m=length_unit_m)
 

@@ -88,7 +88,7 @@ class RecordingFit(_Model):
     @classmethod
     def _lies_at_a_place(cls, told: dict[str, NuisanceValue]) -> dict[str, NuisanceValue]:
         if any(entry.of == "cloth" and entry.unit == "s" for entry in told.values()):
-            raise ValueError("how a cloth lies is in m, rad or 1")
+            raise ValueError("the unit of an initial-state variable must be m, rad or 1")
         return told
 
     @model_validator(mode="after")

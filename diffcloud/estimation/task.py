@@ -34,7 +34,7 @@ class Recording:
 
 
 def compared(record: FitRecord, recordings: Sequence[Recording]) -> AnyObjective:
-    """Return the objective that a recorded fit minimised, at its initial frames.
+    """Return the objective of a finished fit, at the frames in its record.
 
     Args:
         recordings: recordings of the fit, in the same order.

@@ -356,8 +356,8 @@ def refuse_undecoded(names: Iterable[str | Path]) -> None:
     for name in map(str, names):
         if any("\ud800" <= letter <= "\udfff" for letter in name):
             raise DiffCloudError(
-                f"{name.encode('utf-8', 'backslashreplace').decode()} is a name that is not {sys.getfilesystemencoding()}. "
-                "Names of files and folders must be text in that encoding. Rename the file, or run in a UTF-8 locale "
+                f"The name {name.encode('utf-8', 'backslashreplace').decode()} is not {sys.getfilesystemencoding()} text. "
+                "Names of files and folders must be in that encoding. Rename the file, or run in a UTF-8 locale "
                 "(LC_ALL=C.UTF-8)."
             )
 

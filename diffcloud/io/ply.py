@@ -63,7 +63,7 @@ def read_ply(path: Path) -> NDArray[np.float64]:
     columns = [axis for axis in axes if axis is not None]
     least = sum(element.count for element in (*before, vertex))  # [bytes] each element takes at least one
     if least > len(data) - start:
-        raise EpisodeError(f"{path} states {vertex.count} points and is too short for them: it was cut off.")
+        raise EpisodeError(f"{path} states {vertex.count} points, but is shorter than that: it was cut off.")
     try:
         if not order:
             return _from_text(data[start:], before, vertex, columns)

@@ -43,7 +43,7 @@ class RecordedFrame:
 
 @dataclass(frozen=True)
 class Recording:
-    """A recording of another tool, in a form that `write_recording` can write as a raw episode."""
+    """A recording made by other software, in a form that `write_recording` can write as a raw episode."""
 
     cameras: Mapping[str, CameraInfo]
     frames: Iterable[RecordedFrame]

@@ -48,8 +48,8 @@ def results_in_order(client: Any, work: Callable[[Item], Found], items: Sequence
                 raise
             except Exception as error:  # Dask raises several types if it has lost its workers
                 raise DiffCloudError(
-                    f"The Dask scheduler or its workers ended without a word ({type(error).__name__}: {error}). What is "
-                    "finished is kept; run the command again."
+                    f"The Dask scheduler or its workers ended unexpectedly ({type(error).__name__}: {error}). Finished "
+                    "results are kept. Run the command again."
                 ) from error
             yield found
             future.release()

@@ -44,7 +44,7 @@ _MOST_POINTS = 10**7
 
 
 class BackgroundBody(BaseModel):
-    """Fixed body whose points are removed from clouds before the network."""
+    """Fixed body whose points are removed from the input clouds of the network."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 

@@ -109,11 +109,13 @@ def train_regressor(
     began = time.perf_counter()
     if device == "gpu" and not (torch.cuda.is_available() or torch.backends.mps.is_available()):
         raise ConfigError(
-            "Torch finds no GPU on this machine. Use --device cpu, or auto, which takes one where there is one."
+            "Torch finds no GPU on this machine. Use --device cpu, or --device auto, which uses a GPU if there is one."
         )
     _check_sets(train, test, settings)
     if model == "posterior" and (settings.predict_variance or settings.loss != "normalised"):
-        raise ConfigError("A posterior has a loss and widths of its own; leave out predict_variance, and loss: raw.")
+        raise ConfigError(
+            "The model posterior has its own loss and predicts its own widths. Remove predict_variance and loss: raw."
+        )
     if settings.predict_variance and settings.loss == "raw" and settings.target == "logarithmic":
         raise ConfigError(
             "With predict_variance and loss: raw, widths are learned in the parameters' units, but those of a logarithmic "
@@ -151,8 +153,8 @@ def train_regressor(
         resumed_from = _fit(module, clouds, recorder, settings, state, on_gpu=on_gpu, workers=workers)
     except OSError as error:
         raise TrainingError(
-            f"Cannot write the metrics of {live}: {error.strerror or error}. Free the disk and run the command again; it "
-            "goes on from the last saved epoch."
+            f"Cannot write the metrics of {live}: {error.strerror or error}. Free disk space and run the command again. It "
+            "resumes at the last saved epoch."
         ) from error
     assert recorder.weights is not None
     module.network.load_state_dict(recorder.weights)
@@ -181,7 +183,7 @@ def train_regressor(
 
 def _check_sets(train: SimulatedSet, test: SimulatedSet, settings: TrainingSettings) -> None:
     if train.names != test.names or train.scenario != test.scenario or train.nodes.shape[1:] != test.nodes.shape[1:]:
-        raise ConfigError("The train and test draws are of different scenarios or parameters; simulate them together.")
+        raise ConfigError("The train and test sets have different scenarios or parameters. Generate both with one command.")
     if len(train) < 2 or len(test) < 4:
         raise ConfigError(f"Training needs at least 2 train and 4 test draws, got {len(train)} and {len(test)}.")
     if (settings.draws or 2) < 2 or settings.batch_size < 2:

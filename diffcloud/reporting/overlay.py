@@ -1,4 +1,4 @@
-"""What the pages draw in three dimensions: recorded clouds, simulated cloth and what stands around it, over time."""
+"""3-D views of the pages: recorded clouds, simulated cloth and obstacles over time."""
 
 from __future__ import annotations
 
@@ -15,50 +15,50 @@ from diffcloud.io.episodes import ONLY_GRIPPER, Episode
 from diffcloud.mesh.topology import SurfaceMesh
 
 _DECIMALS = 4
-"""A tenth of a millimetre, to keep the page small."""
+"""Decimals of positions [m]: a tenth of a millimetre, to keep the page small."""
 _COLOURS = ("target", "second", "third", "fourth")
-"""Of the cameras: variables of the page's style."""
+"""Colours of the cameras, as variables of the page's style."""
 
 
 @dataclass(frozen=True)
 class Layer:
-    """One thing that is drawn, with a box to hide it. Layers of one name share the box."""
+    """A drawn object with a checkbox that hides it. Layers with the same name share a checkbox."""
 
     name: str
     kind: Literal["points", "mesh", "line", "marks"]
     frames: Sequence[NDArray[Any]] | NDArray[Any]
-    """[N, 3] in each frame; a single one stands still."""
+    """Positions [N, 3] in each frame. A single array does not move."""
     color: str
-    """Variable of the page's style."""
+    """Colour, as a variable of the page's style."""
     faces: NDArray[np.int64] | None = None
-    """[F, 3] of a mesh."""
+    """Faces [F, 3], for a mesh."""
     opacity: float = 0.75
-    """Of a mesh."""
+    """Opacity, for a mesh."""
     labels: tuple[str, ...] = ()
-    """Of marks."""
+    """Texts, for marks."""
     shown: bool = True
-    """Whether it is, before anybody chooses."""
+    """Whether the layer is visible at first."""
 
 
 @dataclass(frozen=True)
 class Overlay:
-    """One episode as it is drawn."""
+    """A drawn episode."""
 
     name: str
     numbers: Sequence[int]
-    """[T] of the frames in the recording."""
+    """[T] frame numbers in the recording."""
     times: NDArray[np.float64]
-    """[T] [s]"""
+    """[T] times of the frames [s]."""
     layers: Sequence[Layer]
     opens: int = 0
-    """Frame that is shown first."""
+    """Index of the frame that is shown first."""
     photographs: Sequence[bytes] = ()
-    """A JPEG for each frame; none where there are no images."""
+    """A JPEG for each frame. Empty without images."""
     residuals_mm: Sequence[float | None] = ()
-    """RMS residual of each frame [mm]; None where the fit did not compare the frame."""
+    """RMS residual of each frame [mm]; None if the fit did not use the frame."""
 
     def data(self) -> dict[str, Any]:
-        """As the page's script takes it."""
+        """Return the data for the script of the page."""
         return {
             "name": self.name,
             "numbers": [int(number) for number in self.numbers],
@@ -89,9 +89,9 @@ def recorded_layers(
     positions of the cameras.
 
     Args:
-        frames: that are drawn.
-        points: of a cloud, at most.
-        rng: of their choice.
+        frames: indices of the drawn frames.
+        points: maximum number of points per cloud.
+        rng: random generator for the choice of points.
         gripper: whether the recorded grippers are visible at first. The recorded point may lie on the tool, centimetres
             from the cloth, so pages with a simulated cloth show its `held_layers` instead.
     """
@@ -138,10 +138,10 @@ def fitted_layers(motion: FittedMotion, times: NDArray[np.float64]) -> list[Laye
 
 
 def held_layers(nodes: NDArray[np.float64], held: NDArray[np.int64]) -> list[Layer]:
-    """Return the held nodes of a cloth that is drawn, and their paths; nothing if no node is held.
+    """Return the held nodes of a cloth and their paths. Empty if no node is held.
 
     Args:
-        nodes: [T, V, 3] of the cloth in each frame that is drawn.
+        nodes: [T, V, 3] positions of the cloth in the drawn frames.
         held: [K] indices of nodes.
     """
     if not len(held):
@@ -152,12 +152,12 @@ def held_layers(nodes: NDArray[np.float64], held: NDArray[np.int64]) -> list[Lay
 
 
 def body_layers(bodies: SurfaceMesh) -> list[Layer]:
-    """What stands around the cloth, if anything does."""
+    """Return the bodies around the cloth."""
     return [Layer("around", "mesh", [bodies.nodes], "soft", bodies.faces, 0.5)] if len(bodies.faces) else []
 
 
 def states_at(times: NDArray[np.float64], wanted: NDArray[np.float64]) -> NDArray[np.int64]:
-    """[W] indices of the simulated times [T] that are nearest to the wanted ones."""
+    """Return the indices [W] of the simulated times [T] that are nearest to the wanted times."""
     return np.abs(times - np.asarray(wanted)[:, None]).argmin(axis=1)
 
 

@@ -17,7 +17,7 @@ _HEADS = ("Episode", "Points per view", "Masked", "Overlap mm", "Cameras moved m
 
 
 class RecordedEntry(Protocol):
-    """What the section needs of an episode."""
+    """Properties of an episode that the section needs."""
 
     @property
     def scenario(self) -> str: ...
@@ -31,19 +31,19 @@ class RecordedEntry(Protocol):
 
 @dataclass(frozen=True)
 class Photograph:
-    """A PNG to stand inside the page."""
+    """A PNG that is embedded in the page."""
 
     caption: str
     base64: str
 
 
 def recordings_table(entries: Sequence[RecordedEntry]) -> Table:
-    """A row for each episode that comes from a raw recording."""
+    """Return a row for each episode that comes from a raw recording."""
     return table(_HEADS, (_row(entry) for entry in entries if _is_recorded(entry)))
 
 
 def recordings_pictures(entries: Sequence[RecordedEntry]) -> list[Photograph]:
-    """What preprocessing drew of them."""
+    """Return the pictures that preprocessing made of raw recordings."""
     return [
         Photograph(f"{entry.name}: {caption}", base64.b64encode(data).decode())
         for entry in entries

@@ -1,4 +1,4 @@
-"""A page to look at episodes before and after a fit: clouds, cloth, gripper, table and cameras over time."""
+"""Page that shows episodes before and after a fit: clouds, cloth, gripper, table and cameras over time."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from diffcloud.scene.scenarios import Scenario
 from diffcloud.sim.simulate import rollout
 
 _BESIDE = 0.25
-"""The table is drawn beyond the cloth by this part of its size: it has no end."""
+"""Margin of the drawn table around the cloth, as a fraction of the cloth's size."""
 _AXES_M = 0.1
 _AXES_NAME = "axes of the world, 10 cm"
 
@@ -35,9 +35,9 @@ def build_view(
     """Return the page as HTML text.
 
     Args:
-        note: a sentence or two on what is shown.
-        facts: lines of the table below, name and value.
-        problems: recording and sentence on what looks wrong.
+        note: one or two sentences that describe the view.
+        facts: name and value of each row of the table below the view.
+        problems: name of the recording, and a sentence, for each fault.
     """
     data = [one.data() for one in overlays]
     return render("view.html", title=title, note=note, facts=facts, problems=problems, overlays=data)
@@ -65,10 +65,10 @@ def scene_layers(scenario: Scenario, episode: Episode, times: NDArray[np.float64
     obstacles around it.
 
     Args:
-        times: [T] of the frames that are drawn [s]; after the end of the scenario the cloth stays as it is then.
+        times: [T] times of the drawn frames [s]. After the end of the scenario, the cloth does not move.
 
     Raises:
-        EpisodeError: other grippers were recorded than the scene has.
+        EpisodeError: the recorded grippers differ from those of the scene.
     """
     system, _ = scenario.scene.build()
     track = None
@@ -87,14 +87,14 @@ def scene_layers(scenario: Scenario, episode: Episode, times: NDArray[np.float64
 
 
 def unposed_layer(scenario: Scenario, recording: RecordingFit, motion: FittedMotion, times: NDArray[np.float64]) -> Layer:
-    """The fitted cloth where the scenario has it, before the pose of the recording was found."""
+    """Return the fitted cloth at its pose in the scene, without the fitted alignment."""
     space, pose = recorded_pose(recording, length_unit_m=scenario.length_unit_m)
     nodes = space.back(torch.as_tensor(motion.nodes[states_at(motion.times, times)]), pose)[0].numpy()
     return Layer("fitted, where the scene has it", "mesh", nodes, "third", motion.faces, 0.35, shown=False)
 
 
 def table_layers(scenario: Scenario, near: NDArray[np.float64]) -> list[Layer]:
-    """The level planes of a scene, as rectangles around points [N, 3]."""
+    """Return the level planes of a scene, as rectangles around points [N, 3]."""
     low, high = near[:, :2].min(axis=0), near[:, :2].max(axis=0)
     margin = _BESIDE * float((high - low).max())
     layers = []

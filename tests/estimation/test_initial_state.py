@@ -200,7 +200,7 @@ def test_it_is_told_as_nuisance_and_read_back(objective, fits, tmp_path):
     assert flat > 5 * again
     (lies,) = initial_nodes(SCENARIO.scene.mesh, column(**record.initial_state_in(record.episodes[0])))
     np.testing.assert_allclose(result.motions[0].nodes[0], lies, atol=1e-15)
-    for change, message in (({"unit": "s"}, "how a cloth lies is in m, rad or 1"), ({"of": "table"}, "cloth")):
+    for change, message in (({"unit": "s"}, "initial-state variable must be m, rad or 1"), ({"of": "table"}, "cloth")):
         told = json.loads((tmp_path / "e.json").read_text())
         told["episodes"][0]["nuisance"]["turn"] |= change
         (tmp_path / "damaged.json").write_text(json.dumps(told))
@@ -208,7 +208,7 @@ def test_it_is_told_as_nuisance_and_read_back(objective, fits, tmp_path):
             read_fit(tmp_path / "damaged.json")
     lost = record.episodes[0].model_copy(update={"nuisance": {"slope": record.nuisance["turn"]}})
     stranger = record.model_copy(update={"episodes": [lost]})
-    with pytest.raises(ConfigError, match="Unknown variable of how a cloth lies 'slope'"):
+    with pytest.raises(ConfigError, match="Unknown initial-state variable 'slope'"):
         space_of(stranger)
 
 

@@ -239,7 +239,7 @@ class TestTracks:
 def test_a_name_that_is_not_in_the_systems_encoding(tmp_path):
     """It could stand in no record, no table and no page."""
     (tmp_path / os.fsdecode(b"a\xff.npz")).write_bytes(b"")
-    with pytest.raises(DiffCloudError, match=r"a\\udcff\.npz is a name that is not utf-8.*Rename the file"):
+    with pytest.raises(DiffCloudError, match=r"a\\udcff\.npz is not utf-8 text.*Rename the file"):
         files_in(tmp_path, ".npz")
     write_text(tmp_path / "t", "a\udcff µ")
     assert (tmp_path / "t").read_text(encoding="utf-8") == "a\\udcff µ"

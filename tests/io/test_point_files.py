@@ -175,7 +175,7 @@ class TestPly:
         with pytest.raises(EpisodeError, match="states 4 points and holds 3: it was cut off"):
             read_cloud(path)
         path.write_bytes(whole.replace(b"vertex 4", b"vertex 4000000000"))
-        with pytest.raises(EpisodeError, match="states 4000000000 points and is too short"):
+        with pytest.raises(EpisodeError, match="states 4000000000 points, but is shorter"):
             read_cloud(path)
         path.write_bytes(whole.replace(b"float x", b"float a"))
         with pytest.raises(EpisodeError, match="its vertices have a, y, z; they need x, y and z"):

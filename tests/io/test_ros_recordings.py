@@ -283,7 +283,7 @@ class TestTransforms:
         """It is mounted on the tool, which rises by 10 cm a second."""
         done = imported(tmp_path, bag(tmp_path, "rosbag2", mount="tool_frame"))
         assert read_raw_episode(tmp_path / "e").cameras["side"].info.T_world_camera is None
-        assert any("'side_optical' moves in 'base_link', by 65 mm" in text for text in done.result["warnings"])
+        assert any("'side_optical' moves relative to 'base_link', by 65 mm" in text for text in done.result["warnings"])
 
     def test_a_frame_with_two_parents_is_not_believed(self, tmp_path):
         class Twice(Bag):
@@ -295,7 +295,10 @@ class TestTransforms:
         Twice(tmp_path / "bag", "rosbag2", Habits()).write()
         done = imported(tmp_path, tmp_path / "bag")
         assert read_raw_episode(tmp_path / "e").cameras["side"].info.T_world_camera is None
-        assert any("puts 'side_link' into both 'base_link' and 'elsewhere'" in text for text in done.result["warnings"])
+        assert any(
+            "gives the frame 'side_link' two parents, 'base_link' and 'elsewhere'" in text
+            for text in done.result["warnings"]
+        )
 
     def test_what_is_no_place_is_left_out(self, tmp_path):
         """A zero quaternion, of a frame that nobody asks for and once of a camera's."""

@@ -96,7 +96,7 @@ class TestTraining:
     @pytest.mark.parametrize("changes", [{"predict_variance": True}, {"loss": "raw"}])
     def test_what_belongs_to_other_models_is_refused(self, tmp_path, changes):
         sets = sagging_sheet(24), sagging_sheet(10, seed=1)
-        with pytest.raises(ConfigError, match="a loss and widths of its own"):
+        with pytest.raises(ConfigError, match="its own loss and predicts its own widths"):
             train_regressor("posterior", *sets, replace(TINY, **changes), tmp_path / "m.safetensors", device="cpu")
 
 

@@ -189,7 +189,7 @@ class TestProblem:
     def test_is_refused_where_units_or_cloth_are_others(self):
         scenario = towel()
         motion = moved(scenario, {})
-        with pytest.raises(ConfigError, match="not SI"):
+        with pytest.raises(ConfigError, match="has a length unit of"):
             fitted_cloth(recording(), motion, replace(scenario, length_unit_m=0.1), {})
         with pytest.raises(ConfigError, match=r"\(25 nodes\) is not that of the scenario lift \(30"):
             fitted_cloth(recording(), motion, towel(nodes=(6, 5)), {})

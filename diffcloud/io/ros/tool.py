@@ -22,20 +22,20 @@ POSES = (
     *("geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/PoseWithCovarianceStamped"),
     *("geometry_msgs/msg/TransformStamped", "nav_msgs/msg/Odometry"),
 )
-"""Messages that state the pose of one frame."""
+"""Types of messages that state the pose of one frame."""
 TOOL_FRAME = "tool_frame"
-"""The tool in tf where nobody names another frame."""
+"""Default frame of the tool in tf."""
 _GAP_S = 0.2
 """A tool that accelerates by 1 m/s² leaves a straight line by 5 mm in this time."""
 
 
 @dataclass(frozen=True)
 class StampedPose:
-    """What a message of `POSES` states."""
+    """Pose in a message of a type in `POSES`."""
 
     frame: str
     child: str
-    """The frame whose pose is stated; empty where the message does not name it."""
+    """Frame whose pose is stated. Empty if the message does not name it."""
     values: tuple[float, ...]
     """Position x, y, z [m] and quaternion x, y, z, w, in `frame`."""
 
@@ -45,18 +45,18 @@ class ToolTrack:
     """Poses of the tool over time."""
 
     name: str
-    """Where they come from, for messages."""
+    """Source of the poses, for messages."""
     times: Floats
-    """[K] in order [s]."""
+    """[K] increasing times [s]."""
     poses: Floats
-    """[K, 4, 4] in the robot's base frame [m]."""
+    """[K, 4, 4] poses in the robot's base frame [m]."""
 
     def positions(self, times: Floats) -> Floats:
-        """[T, 3] positions [m], linear between the poses around each time."""
+        """Return positions [T, 3] [m], interpolated linearly between poses."""
         return np.stack([np.interp(times, self.times, column) for column in self.poses[:, :3, 3].T], axis=1)
 
     def gap(self, times: Floats) -> str | None:
-        """A warning if poses around one of the times [T], all of them inside the track, are far apart; None without."""
+        """Return a warning if poses around one of the times [T] are far apart, else None. Times are inside the track."""
         before, after = np.searchsorted(self.times, times, "right") - 1, np.searchsorted(self.times, times)
         gaps = self.times[after] - self.times[before]
         if gaps.max(initial=0) <= _GAP_S:
@@ -68,7 +68,7 @@ class ToolTrack:
 
 
 def stamped_pose(message: Any) -> StampedPose:
-    """The pose of a message of `POSES`."""
+    """Return the pose in a message of a type in `POSES`."""
     if hasattr(message, "transform"):
         place, turn = message.transform.translation, message.transform.rotation
     else:
@@ -79,13 +79,13 @@ def stamped_pose(message: Any) -> StampedPose:
 
 
 def poses_in_base(name: str, tree: TransformTree, base: str, frame: str, times: Floats) -> Floats:
-    """[T, 4, 4] that map points of a frame to the robot's base frame, at times [T] [s].
+    """Return transforms [T, 4, 4] from a frame to the robot's base frame, at times [T] [s].
 
     Args:
-        name: what is stated in the frame, for messages.
+        name: data that are stated in the frame, for messages.
 
     Raises:
-        EpisodeError: tf does not connect both; names them.
+        EpisodeError: tf does not connect the two frames. The message names them.
     """
     try:
         return tree.lookup(base, frame, times)
@@ -105,17 +105,17 @@ def tool_source(
     named: Sequence[str],
     tf: Collection[str],
 ) -> str | None:
-    """Where the tool's poses come from: a topic of `poses`, the tool's frame in tf, or None if neither is there.
+    """Return the source of the tool's poses: a topic of `poses`, the tool's frame in tf, or None without either.
 
     Args:
-        where: the recording, for messages.
-        poses: by topic.
-        tool_frame: in tf, if the user named it.
+        where: name of the recording, for messages.
+        poses: messages of each topic.
+        tool_frame: frame of the tool in tf, if the user named it.
         named: topics that the user named.
         tf: topics of transforms.
 
     Raises:
-        EpisodeError: several candidates, of which none or several are named; lists them.
+        EpisodeError: there are several candidates, and the user did not name exactly one. The message lists them.
     """
     asked = [topic for topic in poses if topic in named]
     default = [TOOL_FRAME] if TOOL_FRAME in tree.frames else []
@@ -138,14 +138,14 @@ def tool_source(
 def pose_track(
     topic: str, poses: Sequence[StampedPose], stamps: Floats, tree: TransformTree, base: str
 ) -> tuple[ToolTrack, list[str]]:
-    """(the track of one topic, warnings about messages that were left out).
+    """Return the track of one topic, and warnings about omitted messages.
 
     Args:
-        stamps: [N] of the poses, in order of arrival [s].
+        stamps: [N] times of the poses, in order of arrival [s].
 
     Raises:
-        EpisodeError: a clock that was set back, poses of several frames, none that is finite, or a frame that tf does
-            not connect with the base.
+        EpisodeError: the clock was set back, the poses are of several frames, no pose is finite, or tf does not
+            connect the frame with the base.
     """
     kinds = sorted({(held.frame.strip("/"), held.child) for held in poses})
     if len(kinds) > 1:
@@ -168,10 +168,10 @@ def pose_track(
 
 
 def tf_track(frame: str, tree: TransformTree, base: str, span: Floats) -> ToolTrack:
-    """The track of a frame in tf, at the stamps of the transforms that move it.
+    """Return the track of a frame in tf, at the stamps of the transforms that move it.
 
     Args:
-        span: [2] first and last time of the clouds [s], for a tool that does not move.
+        span: [2] first and last time of the clouds [s], used if the tool does not move.
 
     Raises:
         EpisodeError: tf does not connect the frame with the base, or its transforms share no span of time.
@@ -200,14 +200,14 @@ def joint_track(
     named: Sequence[str],
     tool_pose: Callable[[Floats], Floats],
 ) -> tuple[ToolTrack, list[str]]:
-    """(the track that follows from joint states, warnings).
+    """Return the track that follows from joint states, and warnings.
 
     Args:
-        joint_names, named: as of `joint_log`.
+        joint_names, named: see `joint_log`.
         tool_pose: joint angles [K, J] -> poses of the tool [K, 4, 4] in the robot's base frame.
 
     Raises:
-        EpisodeError: as `joint_log`.
+        EpisodeError: see `joint_log`.
     """
     log, _ = joint_log(
         where,

@@ -155,7 +155,7 @@ class TransformTree:
         moved, turned = np.linalg.norm(poses[:, :3, 3] - poses[0, :3, 3], axis=1).max(), turns.magnitude().max()
         if moved > _MOVED_M or turned > _MOVED_RAD:
             raise EpisodeError(
-                f"in tf {_plain(source)!r} moves in {_plain(target)!r}, by {1000 * moved:.0f} mm and "
+                f"in tf {_plain(source)!r} moves relative to {_plain(target)!r}, by {1000 * moved:.0f} mm and "
                 f"{np.rad2deg(turned):.1f} degrees"
             )
         return np.asarray(poses[0])
@@ -168,7 +168,7 @@ class TransformTree:
             for frame in (up[-1], down[-1]):
                 if frame in self._doubtful:
                     parents = " and ".join(map(repr, self._doubtful[frame]))
-                    raise EpisodeError(f"tf puts {frame!r} into both {parents}, and which of them holds cannot be told")
+                    raise EpisodeError(f"tf gives the frame {frame!r} two parents, {parents}; it must have one")
             frames = self.frames
             known = f"its frames are {', '.join(sorted(frames))}" if frames else "the recording has none"
             raise EpisodeError(f"tf does not connect {_plain(source)!r} with {_plain(target)!r}; {known}")

@@ -23,7 +23,7 @@ def parse_uncertain(text: str) -> dict[str, float]:
         if name not in PARAMETERS:
             raise ConfigError(f"uncertain: {unknown_name('parameter', name, PARAMETERS)}")
         if name in found:
-            raise ConfigError(f"uncertain name {name} twice.")
+            raise ConfigError(f"uncertain names {name} twice. State it once.")
         told = f"uncertain {item.strip()!r}: {name} takes the factor within which it is known"
         found[name] = parse_factor(
             value,

@@ -150,7 +150,7 @@ def distance_of(pairs: Ints, c: int, points: Floats, x: Floats, found: Floats) -
 
 @kernel
 def distances_at(work: Work, room: Room, points: Floats) -> Floats:
-    """Distances [C] of the room's pairs at points [N, 3], or lower bounds if they exceed the thickness [m]."""
+    """Return distances [C] [m] of the listed pairs at points [N, 3]. Above the contact thickness they are lower bounds."""
     law = work.law
     pairs, begin, old = room.pairs, room.begin, room.distances
     distances = np.empty(len(pairs))

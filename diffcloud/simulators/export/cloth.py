@@ -77,8 +77,8 @@ def fitted_cloth(
     """
     if scenario.length_unit_m != 1:
         raise ConfigError(
-            f"{scenario.name} measures in units of {scenario.length_unit_m:g} m, and its numbers are not SI; fit the "
-            "recording in a scenario in metres, such as recorded_lift or recorded_fold."
+            f"{scenario.name} has a length unit of {scenario.length_unit_m:g} m. An export needs metres. Fit the recording "
+            "in a scene in metres, such as recorded_lift or recorded_fold."
         )
     scene = scenario.fitted_scene(values)
     if motion.nodes.shape[1] != len(scene.mesh.nodes) or not np.array_equal(motion.faces, scene.mesh.faces):
@@ -239,8 +239,8 @@ def _held(scene: Scene, motion: FittedMotion, paths: NDArray[np.float64]) -> tup
     absent = {handle.node for handle in scene.handles.handles} - rows.keys()
     if absent:
         raise ConfigError(
-            f"The fit's motion holds the nodes {sorted(rows)}, its scenario's handles are at {sorted(absent)}, too: they "
-            "do not belong together. Put the fitted scene's YAML file into scenes/ beside the fit, or fit again."
+            f"The fit holds the nodes {sorted(rows)}, but its scene also holds {sorted(absent)}. Fit and scene must hold "
+            "the same nodes. Put the fitted scene's YAML file into scenes/ beside the fit, or fit again."
         )
     held: dict[int, Motion | None] = {}
     loose = set()
