@@ -53,6 +53,7 @@ FIGURES = [
     coverage(r"pad stated 1\.5 times wrong", "untold"),
     coverage(r"two lifts, fitted jointly \(an earlier version\)", "joint: two lifts of each towel"),
     coverage(r"one lift in Newton \(an earlier version\)", "newton"),
+    coverage(r"one lift, seen by one camera", r"391093 \| one camera"),
     coverage(r"one fold", "folds"),
     Figure(
         "README.md", r"pad stated (?P<factor>[\d.]+) times wrong", FOREIGN, r"stated (?P<factor>[\d.]+) times too large"
