@@ -30,6 +30,12 @@ class Figure:
     pattern: str
 
 
+def stiffness(nodes: str) -> Figure:
+    """A row of the stiffness on coarse meshes."""
+    row = rf"\| {nodes} \| (?P<pad>[\d.]+) N/m \| (?P<pivot>[\d.]+) N/m \| (?P<seconds>[\d.]+) s \|"
+    return Figure("docs/physics.md", row, "docs/results/discretisation.md", row)
+
+
 def coverage(text: str, row: str) -> Figure:
     """A row of README's table of intervals, which has the row of `FOREIGN` that matches `row`."""
     shown = rf"{text} {HELD}(?P<percent>\d+) %"
@@ -76,6 +82,7 @@ FIGURES = [
         "docs/results/comparison.md",
         r"DiffCloud is lowest in (?P<lifts>\d+ of \d+) \(release_lift\), (?P<folds>\d+ of \d+) \(release_fold\)",
     ),
+    *(stiffness(nodes) for nodes in ("7 × 6", "9 × 7", "13 × 10", "19 × 15")),
     Figure(
         "docs/regressors.md",
         r"trains for (?P<low>\d+) to (?P<high>\d+) minutes",
