@@ -1,8 +1,7 @@
 """Search for the initial state of a recorded cloth of any shape, given as a triangle mesh.
 
-On a table, the mesh is placed with either face up, in 24 directions, and aligned with the first cloud. From one gripper, it
-is hung by the points of its outline that fit the height of the cloud. The hypothesis with the smallest RMS distance is
-chosen.
+The mesh is placed on the table with either face up, in 24 directions, and aligned with the first cloud. The hypothesis with
+the smallest RMS distance is chosen.
 """
 
 from __future__ import annotations
@@ -14,25 +13,16 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import cKDTree
 
-from diffcloud.errors import EpisodeError, SceneError
+from diffcloud.errors import EpisodeError
 from diffcloud.identification.hanging import (
     CAP_M,
     WORST_M,
-    aligned,
     both_ways,
-    first_cloud,
-    hanging_course,
     on_surface,
-    refuse_far,
 )
 from diffcloud.io.episodes import Episode
-from diffcloud.mesh.simplified import lines
-from diffcloud.mesh.topology import SurfaceMesh, directed_edges
-from diffcloud.scene.scenarios.catalogue import own_options
 from diffcloud.scene.scenarios.layout import (
     GAP_M,
     HAND_M,
@@ -47,15 +37,12 @@ from diffcloud.scene.scenarios.layout import (
     refuse_beside,
     refuse_table,
 )
-from diffcloud.scene.scenarios.surface import MeshScenario, flat_points, level_frame, mesh_scenario, read_mesh
+from diffcloud.scene.scenarios.surface import flat_points, level_frame, read_mesh
 
 Floats = NDArray[np.float64]
 
-MESH_FIELDS = {
-    "flat": ("up", "center_m", "yaw_deg", "table_height_m", "grippers", "rate_hz", "frames", "path"),
-    "hang": ("yaw_deg", "grippers", "rate_hz", "frames", "steps_per_frame", "path"),
-}
-"""Start -> scenario fields that `find_mesh` determines."""
+MESH_FIELDS = ("up", "center_m", "yaw_deg", "table_height_m", "grippers", "rate_hz", "frames", "path")
+"""Scenario fields that `find_mesh` determines."""
 _TURNS = 24
 _STAGES = ((300, 10, 2 * _TURNS), (1500, 30, 6))
 """Numbers of cloud points, iterations and hypotheses in both stages of the alignment."""
@@ -65,13 +52,6 @@ _DAMPING = 0.02
 _BESIDE_M = 0.03
 _TOLD = 4
 """Number of hypotheses that messages list."""
-_COARSE, _HUNG = 100, 16
-"""Number of nodes of the mesh that is hung, and of the points by which it is hung."""
-_HUNG_TURNS = 8
-_CLEAR, _ELSEWHERE_M = 1.5, 0.06
-"""Factor of the RMS distance up to which a grasp elsewhere is as likely, and its distance [m]."""
-_REACH = (0.9, 1.5)
-"""Longest way along the mesh from the held point, relative to the height of the cloud. Folds shorten the cloud."""
 
 
 def find_mesh(episode: Episode, cloth: Mapping[str, Any]) -> Layout:
@@ -86,10 +66,6 @@ def find_mesh(episode: Episode, cloth: Mapping[str, Any]) -> Layout:
             the distances.
         MeshError: the mesh cannot be a cloth.
     """
-    return (_hanging if cloth["start"] == "hang" else _flat)(episode, cloth)
-
-
-def _flat(episode: Episode, cloth: Mapping[str, Any]) -> Layout:
     assert episode.gripper is not None
     surface = read_mesh(Path(cloth["mesh"]), int(cloth["nodes"]))
     frame = level_frame(surface.nodes, surface.faces)
@@ -194,78 +170,6 @@ def _on_mesh(point: Floats, frame: tuple[Floats, Floats], up: str, yaw: float) -
     if up == "back":
         flat = flat * [1, -1, -1]
     return np.asarray(flat @ rotation + centre)
-
-
-def _hanging(episode: Episode, cloth: Mapping[str, Any]) -> Layout:
-    assert episode.gripper is not None
-    if len(episode.grippers) > 1:
-        raise EpisodeError(
-            f"The cloth hangs at the start, and the recording has the grippers {', '.join(episode.grippers)}. A mesh that "
-            "hangs may be held by one. Begin the recording on a table, or state the scene in a file with `base: mesh`."
-        )
-    (name,) = episode.grippers
-    cloud, gripper = first_cloud(episode), episode.gripper[:, 0]
-    course = hanging_course(episode)
-    fields = {**cloth, **{key: one.value for key, one in course.items()}}
-    surface = read_mesh(Path(cloth["mesh"]), _COARSE)
-    top = cloud[cloud[:, 2].argsort()[-max(len(cloud) // 100, 1) :]].mean(axis=0)
-    tried = list[tuple[float, Floats, float, Floats]]()
-
-    def hang(points: Sequence[Floats], nodes: int) -> None:
-        for point in points:
-            hold = {name: {"on_mesh_m": point.tolist(), "at_m": top.tolist()}}
-            options = own_options({**fields, "nodes": nodes, "grippers": hold}, "mesh", "the cloth", folder=Path())
-            assert isinstance(options, MeshScenario)
-            try:
-                mesh = mesh_scenario(options).scene.mesh
-            except SceneError:  # it does not come to rest
-                continue
-            for angle in 2 * np.pi * np.arange(_HUNG_TURNS) / _HUNG_TURNS:
-                cosine, sine = math.cos(angle), math.sin(angle)
-                turn = np.array([[cosine, sine, 0.0], [-sine, cosine, 0.0], [0.0, 0.0, 1.0]])
-                at, turned, rms = aligned((mesh.nodes - top) @ turn + top, mesh.faces, top, cloud)
-                tried.append((rms, at, float(angle) + turned, point))
-        tried.sort(key=lambda one: one[0])
-
-    hang(_grasps(surface, float(np.ptp(np.quantile(cloud[:, 2], [0.005, 0.995])))), _COARSE)
-    if tried:
-        near = np.linalg.norm(surface.nodes - tried[0][3], axis=1).argsort()
-        hang([surface.nodes[node] for node in near[1:4]], _COARSE)
-        hang([tried[0][3]], int(cloth["nodes"]))
-    listed = _distinct([(rms, f"by {_rounded(point)}") for rms, _, _, point in tried])
-    _refuse_other(tried[0][0] if tried else math.inf, listed, cloth["mesh"])
-    _, at, yaw, point = tried[0]
-    found = {
-        "yaw_deg": Found(round(math.degrees(yaw) % 360, 2), "where the settled cloth is nearest to the first cloud"),
-        "grippers": Found(
-            {name: {"on_mesh_m": _rounded(point), "at_m": _rounded(at)}},
-            f"point of the mesh that is held, and its place; nearest to the first cloud: {listed}",
-        ),
-        **course,
-    }
-    others = [
-        rms for rms, _, _, other in tried if np.linalg.norm(other - point) > _ELSEWHERE_M and rms < _CLEAR * tried[0][0]
-    ]
-    unclear = [
-        f"the first cloud does not show clearly by which point the cloth hangs ({listed}); correct on_mesh_m"
-    ] * bool(others)
-    return Layout(found, (*unclear, *refuse_far(at, gripper[0])))
-
-
-def _grasps(surface: SurfaceMesh, height: float) -> list[Floats]:
-    """Return points of the outline from which the mesh reaches about as far down as the cloud is high."""
-    edges, _ = directed_edges(surface.faces)
-    lengths = np.linalg.norm(surface.nodes[edges[:, 0]] - surface.nodes[edges[:, 1]], axis=1)
-    graph = coo_array((lengths, edges.T), shape=(len(surface.nodes),) * 2).tocsr()
-    rim = np.unique(lines(surface))
-    reach = dijkstra(graph, directed=False, indices=rim).max(axis=1)
-    places = surface.nodes[rim[(reach > _REACH[0] * height) & (reach < _REACH[1] * height)]]
-    chosen = list[Floats]()
-    away = np.ones(len(places))
-    while len(chosen) < min(_HUNG, len(places)):  # spread over the outline
-        chosen.append(places[away.argmax()])
-        away = np.minimum(away, np.linalg.norm(places - chosen[-1], axis=1))
-    return chosen
 
 
 def _refuse_other(rms: float, listed: str, mesh: str) -> None:

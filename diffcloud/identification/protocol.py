@@ -66,7 +66,12 @@ def found_cloth(
     told = "as weighed" if density is not None else "usual for a knit; fitted"
     material = {"density_kg_m2": density or _DENSITY, **_MATERIAL}
     if mesh is not None:
-        return _found_mesh(mesh, material, told, hanging=all(hanging))
+        if any(hanging):
+            raise EpisodeError(
+                "The cloth hangs at the start, and --mesh takes one that lies on a table. Begin the recording on a table, "
+                "or state the start in a scene file (`base: mesh`, `start: hang`) and pass it with --scene."
+            )
+        return _found_mesh(mesh, material, told)
     reason = "as stated"
     if size is None:
         sides = np.array([hanging_size(episode) if all(hanging) else found_size(episode) for episode in episodes])
@@ -94,23 +99,14 @@ def found_cloth(
     }
 
 
-def _found_mesh(mesh: Path, material: Mapping[str, float], told: str, *, hanging: bool) -> dict[str, Found]:
+def _found_mesh(mesh: Path, material: Mapping[str, float], told: str) -> dict[str, Found]:
     """Return the fields of a cloth of any shape."""
     if not mesh.is_file():
         raise ConfigError(f"--mesh takes an OBJ file, and there is none at {mesh}.")
-    shared = {
+    return {
         "base": Found("mesh", "a cloth in the shape of a triangle mesh"),
         "mesh": Found(str(mesh.resolve()), "as stated; its edges have their lengths at rest"),
         "nodes": Found(_MESH_NODES, "a mesh of more than 500 nodes is simplified to about this number"),
-        "start": Found("hang" if hanging else "flat", "hanging from the gripper" if hanging else "on a table"),
-    }
-    if hanging:
-        size = Found(GRIP_M, "size of the grasp; measure your gripper's [m]")
-        pivot = Found("pivot", "a point that lets the cloth turn; or pad, which keeps its direction")
-        apart = Found(False, "layers that touch take longer")
-        return {**shared, "grip": pivot, "grip_m": size, "self_contact": apart, **_hanging(material, told)}
-    return {
-        **shared,
         "grip": Found("pad", "fingers level; or pivot (a point that lets the cloth turn)"),
         **_flat(material, told),
     }
@@ -147,11 +143,11 @@ def missing_fields(cloth: Mapping[str, Any], layout: Mapping[str, Any] | None = 
     """Return the names of fields that a cloth, or the layout of a recording of it, must state and does not."""
     base = cloth.get("base")
     if layout is None:
-        own = {"hang": ("size_m",), "mesh": ("mesh", "start", "grip")}.get(str(base), ("size_m", "grip", "steps_per_frame"))
+        own = {"hang": ("size_m",), "mesh": ("mesh", "grip")}.get(str(base), ("size_m", "grip", "steps_per_frame"))
         return [name for name in ("base", *own, "nodes", "material", "grip_m") if name not in cloth]
     needed: tuple[str, ...] = HANG_FIELDS if base == "hang" else FIELDS
     if base == "mesh":
-        needed = MESH_FIELDS[cloth["start"]]
+        needed = MESH_FIELDS
     elif base != "hang" and "grippers" not in layout:
         needed = (*needed, "grasped")
     return [name for name in needed if name not in layout]
