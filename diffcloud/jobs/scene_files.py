@@ -184,7 +184,8 @@ def _cloth(
             ("mesh", "--mesh", None if mesh is None else str(mesh.resolve())),
         ):
             if given is not None and given != fields.get(name):
-                warn(f"{path} says {name} {fields.get(name)}, and that counts, not {option} {given}: edit the file.")
+                told = "x".join(f"{side:g}" for side in given) if isinstance(given, list) else given
+                warn(f"{path} says {name} {fields.get(name)}, and that counts, not {option} {told}: edit the file.")
         return fields
     found = found_cloth(list(episodes.values()), stated, mass, mesh)
     write_text(path, _yaml(found))
