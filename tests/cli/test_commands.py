@@ -673,4 +673,4 @@ def test_a_study_of_steps_and_meshes_writes_its_page(work):
     page = (work / "page.md").read_text()
     assert "| tiny | implicit, BDF2 | 2 (default) |" in page
     assert "| tiny | arcsim | 32 |" in page
-    assert "## Meshes" in page
+    assert "<summary>Meshes</summary>" in page
