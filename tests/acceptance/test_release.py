@@ -83,7 +83,9 @@ def test_whole_episodes_with_contact_are_the_reference_simulators(release, run, 
 
 
 def test_simulated_clouds_are_met_at_their_true_parameters(release):
-    counts = re.search(r"in (\d+) of 12 recordings at the frame of the loss, and in (\d+) of 12", _simulated_clouds(release))
+    counts = re.search(
+        r"in (\d+) of 12 recordings at the frame of the loss, and in (\d+) of 12", _simulated_clouds(release)
+    )
     assert counts
     at_loss, always = map(int, counts.groups())
     assert at_loss >= 10
