@@ -83,7 +83,7 @@ def hangs(episode: Episode) -> bool:
     """Return whether the first cloud is upright and below the gripper."""
     if episode.gripper is None:
         return False
-    cloud = first_cloud(episode)
+    cloud = _first_cloud(episode)
     low, high = np.quantile(cloud, [_EDGE, 1 - _EDGE], axis=0)
     wide = float(np.linalg.norm((high - low)[:2]))
     return bool(high[2] - low[2] > _UPRIGHT * wide and episode.gripper[0, 0, 2] > np.median(cloud[:, 2]))
@@ -91,7 +91,7 @@ def hangs(episode: Episode) -> bool:
 
 def hanging_size(episode: Episode) -> tuple[float, float]:
     """Return the extents [m] of the first cloud, longer one first: the sides of a cloth that hangs from a side."""
-    cloud = first_cloud(episode)
+    cloud = _first_cloud(episode)
     along, _ = _axes(cloud)
     sides = [float(np.ptp(np.quantile(values, [_EDGE, 1 - _EDGE]))) for values in (cloud @ along, cloud[:, 2])]
     return max(sides), min(sides)
@@ -130,8 +130,8 @@ def find_hanging(episode: Episode, cloth: Mapping[str, Any]) -> Layout:
             f"The recording has the grippers {', '.join(episode.grippers)}. A hanging cloth is held by one, or by two at "
             "the corners of a side. Leave the other tracks out."
         )
-    cloud, grippers = first_cloud(episode), episode.gripper[0]
-    shared = hanging_course(episode)
+    cloud, grippers = _first_cloud(episode), episode.gripper[0]
+    shared = _course(episode)
     base = {**cloth, **{name: one.value for name, one in shared.items()}}
     tried: list[_Hypothesis] = []
     for fields in _ways(cloud, tuple(cloth["size_m"])):
@@ -140,7 +140,7 @@ def find_hanging(episode: Episode, cloth: Mapping[str, Any]) -> Layout:
         options = own_options({**base, **fields}, "hang", "the cloth", folder=Path())
         assert isinstance(options, HangScenario)
         try:
-            tried.append(_held_by(_placed(options, cloud), episode))
+            tried.append(_held_by(_aligned(options, cloud), episode))
         except SceneError:  # it does not come to rest
             continue
     tried.sort(key=lambda one: one.rms_m)
@@ -154,7 +154,7 @@ def find_hanging(episode: Episode, cloth: Mapping[str, Any]) -> Layout:
     ties = [one for one in tried if one.rms_m < _TIE * tried[0].rms_m]
     best, reason = _by_motion(ties, episode) if len(ties) > 1 else (ties[0], "nearest to the first cloud")
     chosen = best.options
-    warnings = refuse_far(np.array(chosen.rim_m), grippers.mean(axis=0))
+    warnings = _refuse_far(np.array(chosen.rim_m), grippers.mean(axis=0))
     found = {
         "held": Found(chosen.held, f"{reason}: {scores}"),
         "side": Found(chosen.side, "the held side, along the cloth's own x or y"),
@@ -167,7 +167,7 @@ def find_hanging(episode: Episode, cloth: Mapping[str, Any]) -> Layout:
     return Layout(found, tuple(warnings))
 
 
-def hanging_course(episode: Episode) -> dict[str, Found]:
+def _course(episode: Episode) -> dict[str, Found]:
     """Return the scenario fields of time and path of a recording that begins with a hanging cloth."""
     assert episode.gripper is not None
     gripper = episode.gripper[:, 0]
@@ -185,7 +185,7 @@ def hanging_course(episode: Episode) -> dict[str, Found]:
     }
 
 
-def refuse_far(held: Floats, gripper: Floats) -> list[str]:
+def _refuse_far(held: Floats, gripper: Floats) -> list[str]:
     """Return a warning if the held part [3] is not at the gripper [3].
 
     Raises:
@@ -202,7 +202,7 @@ def refuse_far(held: Floats, gripper: Floats) -> list[str]:
     return [f"the held part of the cloth is {1e3 * away:.0f} mm from the gripper; it follows the gripper without turning"]
 
 
-def first_cloud(episode: Episode) -> Floats:
+def _first_cloud(episode: Episode) -> Floats:
     """Return points [N, 3] of the frames before the gripper moves [m]."""
     assert episode.gripper is not None
     way = np.linalg.norm(episode.gripper - episode.gripper[0], axis=2).max(axis=1)
@@ -240,15 +240,6 @@ def _ways(cloud: Floats, size: tuple[float, float]) -> list[dict[str, Any]]:
     return [*ways, *({"held": "corner", "rim_m": highest.tolist(), "yaw_deg": (yaw + turn) % 360} for turn in turns)]
 
 
-def _placed(options: HangScenario, cloud: Floats) -> _Hypothesis:
-    """Align a settled cloth with the cloud."""
-    mesh = hang_scenario(options).scene.mesh
-    rim, turned, rms = aligned(mesh.nodes, mesh.faces, np.array(options.rim_m), cloud)
-    x, y, z = rim.tolist()
-    placed = {"rim_m": (x, y, z), "yaw_deg": (options.yaw_deg + math.degrees(turned)) % 360}
-    return _Hypothesis(options.model_copy(update=placed), rms)
-
-
 def _held_by(one: _Hypothesis, episode: Episode) -> _Hypothesis:
     """Assign each of two held corners to the gripper at its place."""
     assert episode.gripper is not None
@@ -262,16 +253,10 @@ def _held_by(one: _Hypothesis, episode: Episode) -> _Hypothesis:
     return replace(one, options=options.model_copy(update={"grippers": ordered}))
 
 
-def aligned(nodes: Floats, faces: NDArray[np.int64], held: Floats, cloud: Floats) -> tuple[Floats, float, float]:
-    """Align a settled cloth [V, 3] with the cloud [N, 3] by translation and rotation about the vertical (ICP).
-
-    Args:
-        held: [3] a point that moves with the cloth.
-
-    Returns:
-        The moved point [3], the rotation [rad], and the RMS distance [m].
-    """
-    turned = 0.0
+def _aligned(options: HangScenario, cloud: Floats) -> _Hypothesis:
+    """Align a settled cloth with the cloud by translation and rotation about the vertical (ICP)."""
+    mesh = hang_scenario(options).scene.mesh
+    nodes, faces, rim, turned = mesh.nodes, mesh.faces, np.array(options.rim_m), 0.0
     for _ in range(_ALIGNING):
         place = on_surface(cloud, nodes, faces)
         near = np.linalg.norm(cloud - place, axis=1) < CAP_M
@@ -285,8 +270,10 @@ def aligned(nodes: Floats, faces: NDArray[np.int64], held: Floats, cloud: Floats
         cosine, sine = math.cos(angle), math.sin(angle)
         turn = np.array([[cosine, sine, 0.0], [-sine, cosine, 0.0], [0.0, 0.0, 1.0]])  # for row vectors
         shift = b.mean(axis=0) - a.mean(axis=0) @ turn
-        nodes, held, turned = nodes @ turn + shift, held @ turn + shift, turned + angle
-    return held, turned, both_ways(cloud, nodes, faces)
+        nodes, rim, turned = nodes @ turn + shift, rim @ turn + shift, turned + angle
+    x, y, z = rim.tolist()
+    placed = {"rim_m": (x, y, z), "yaw_deg": (options.yaw_deg + math.degrees(turned)) % 360}
+    return _Hypothesis(options.model_copy(update=placed), both_ways(cloud, nodes, faces))
 
 
 def both_ways(cloud: Floats, nodes: Floats, faces: NDArray[np.int64]) -> float:

@@ -16,12 +16,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from diffcloud.errors import EpisodeError
-from diffcloud.identification.hanging import (
-    CAP_M,
-    WORST_M,
-    both_ways,
-    on_surface,
-)
+from diffcloud.identification.hanging import CAP_M, WORST_M, both_ways, on_surface
 from diffcloud.io.episodes import Episode
 from diffcloud.scene.scenarios.layout import (
     GAP_M,
@@ -37,7 +32,7 @@ from diffcloud.scene.scenarios.layout import (
     refuse_beside,
     refuse_table,
 )
-from diffcloud.scene.scenarios.surface import flat_points, level_frame, read_mesh
+from diffcloud.scene.scenarios.surface import about_vertical, flat_points, level_frame, read_mesh
 
 Floats = NDArray[np.float64]
 
@@ -135,8 +130,7 @@ def _aligned_flat(
     own = np.concatenate([flat, flat[faces].mean(axis=1)])
     centre = place * [1, 1, 0]
     for _ in range(steps):
-        cosine, sine = math.cos(yaw), math.sin(yaw)
-        turn = np.array([[cosine, sine, 0], [-sine, cosine, 0], [0, 0, 1]])
+        turn = about_vertical(yaw)
         local = (cloud - centre) @ turn.T
         outside = (local - on_surface(local, flat, faces)) @ turn
         placed = own @ turn
@@ -157,16 +151,13 @@ def _aligned_flat(
         yaw += float(step[2])
         if np.abs(step[:2]).max() < _FINISHED_M and abs(step[2]) * math.sqrt(size) < _FINISHED_M:
             break
-    cosine, sine = math.cos(yaw), math.sin(yaw)
-    turn = np.array([[cosine, sine, 0], [-sine, cosine, 0], [0, 0, 1]])
-    return both_ways(cloud, flat @ turn + centre, faces), centre, yaw
+    return both_ways(cloud, flat @ about_vertical(yaw) + centre, faces), centre, yaw
 
 
 def _on_mesh(point: Floats, frame: tuple[Floats, Floats], up: str, yaw: float) -> Floats:
     """Return the coordinates [3] in the mesh file of a point about the flat mesh's origin."""
     rotation, centre = frame
-    cosine, sine = math.cos(yaw), math.sin(yaw)
-    flat = point @ np.array([[cosine, -sine, 0], [sine, cosine, 0], [0, 0, 1]])
+    flat = point @ about_vertical(-yaw)
     if up == "back":
         flat = flat * [1, -1, -1]
     return np.asarray(flat @ rotation + centre)
@@ -178,7 +169,7 @@ def _refuse_other(rms: float, listed: str, mesh: str) -> None:
         raise EpisodeError(
             f"The first cloud is not that of the cloth {mesh}. RMS distances of the nearest hypotheses: {listed}; at most "
             f"{1e3 * WORST_M:.0f} mm are allowed. Check that mesh and clouds are in metres, that the cloud shows the whole "
-            "cloth and nothing else, and that the cloth lies flat or hangs from the gripper."
+            "cloth and nothing else, and that the cloth lies flat."
         )
 
 
@@ -187,7 +178,7 @@ def _distinct(scored: Sequence[tuple[float, str]]) -> str:
     words = dict[str, float]()
     for rms, name in scored:
         words.setdefault(name, rms)
-    return "; ".join(f"{name} {1e3 * rms:.0f} mm" for name, rms in list(words.items())[:_TOLD]) or "none comes to rest"
+    return "; ".join(f"{name} {1e3 * rms:.0f} mm" for name, rms in list(words.items())[:_TOLD])
 
 
 def _rounded(point: Floats) -> list[float]:

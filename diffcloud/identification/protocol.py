@@ -86,7 +86,10 @@ def found_cloth(
             "size_m": Found(list(size), reason),
             "nodes": Found(nodes, f"{_HANGING_NODES} along the longer side: a hanging cloth bends little"),
             "grip_m": Found(GRIP_M, "size of the grasp at a corner; measure your gripper's [m]"),
-            **_hanging(material, told),
+            "air": Found("still", "air moves with a hanging cloth; none for simulators without air"),
+            "material": Found(material, f"nominal material; density {told}"),
+            "compression": Found(_AROUND["compression"], "usual; fitted too, within `uncertain`"),
+            "uncertain": Found(_HANGING_UNCERTAIN, "priors of what is fitted too: factors of one standard deviation"),
         }
     return {
         "base": Found("lift", "a rectangular cloth on a table"),
@@ -109,16 +112,6 @@ def _found_mesh(mesh: Path, material: Mapping[str, float], told: str) -> dict[st
         "nodes": Found(_MESH_NODES, "a mesh of more than 500 nodes is simplified to about this number"),
         "grip": Found("pad", "fingers level; or pivot (a point that lets the cloth turn)"),
         **_flat(material, told),
-    }
-
-
-def _hanging(material: Mapping[str, float], told: str) -> dict[str, Found]:
-    """Return the fields that all hanging cloths share."""
-    return {
-        "air": Found("still", "air moves with a hanging cloth; none for simulators without air"),
-        "material": Found(material, f"nominal material; density {told}"),
-        "compression": Found(_AROUND["compression"], "usual; fitted too, within `uncertain`"),
-        "uncertain": Found(_HANGING_UNCERTAIN, "priors of what is fitted too: factors of one standard deviation"),
     }
 
 

@@ -190,8 +190,13 @@ def flat_points(points: Floats, frame: tuple[Floats, Floats], up: str, yaw: floa
     flat = (points - centre) @ rotation.T
     if up == "back":
         flat = flat * [1, -1, -1]
+    return np.asarray(flat @ about_vertical(yaw))
+
+
+def about_vertical(yaw: float) -> Floats:
+    """Return the matrix [3, 3] that rotates row vectors by `yaw` [rad] about the vertical."""
     cosine, sine = np.cos(yaw), np.sin(yaw)
-    return np.asarray(flat @ np.array([[cosine, sine, 0], [-sine, cosine, 0], [0, 0, 1]]))
+    return np.array([[cosine, sine, 0], [-sine, cosine, 0], [0, 0, 1]])
 
 
 def _flat(options: MeshScenario, rest: SurfaceMesh) -> Floats:
