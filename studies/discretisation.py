@@ -84,10 +84,10 @@ def _page(own: dict[str, Scene], steps: list[StepRow], meshes: list[MeshRow]) ->
         f"{', '.join(f'{row[4]} mm ({row[0]})' for row in defaults)}.",
         markdown_table(head, defaults),
         note="RMS node distances at the frame of the loss, over nine pairs of stretching and density: the middles of "
-        f"nine equal parts of their bounds, on the logarithmic scale. The start is also changed by {NUDGE:.0e} m or "
-        f"{1e3 * PUSH:g} mm at random. If the first change grows, the motion is chaotic. If the second grows, as in "
-        "folds that may buckle to either side, no recording repeats. Milliseconds are processor time of one core up to "
-        "that frame.",
+        "nine equal parts of their bounds, on the logarithmic scale. In two further runs, the initial positions of the "
+        f"nodes are changed at random, by {NUDGE:.0e} m and by {1e3 * PUSH:g} mm. If the first change grows, the motion is "
+        "chaotic. If the second grows, as in folds that may buckle to either side, no recording repeats. Milliseconds are "
+        "processor time of one core up to that frame.",
         command="python -m studies discretisation",
         details={
             "All steps": [markdown_table(head, rows)],

@@ -422,8 +422,9 @@ def _page(rows: Sequence[Row], swings: Mapping[str, tuple[float, float]], figure
     alone, with_air = rows[:2]
     return result_page(
         "Does air move with a cloth?",
-        f"Yes: a free swing of the real cloth has a period of {half:.3f} s (median of {len(swings)}), the model without "
-        f"this air {alone.period:.3f} s and with it {with_air.period:.3f} s. The median RMS of the "
+        f"Yes. The real cloth swings freely with a period of {half:.3f} s (median of {len(swings)} swings). The model's "
+        f"period is {alone.period:.3f} s without the air that moves along and {with_air.period:.3f} s with it. The median "
+        "RMS of the "
         f"{len(swings) - len(FITTED)} predicted recordings falls from {_median(alone):.1f} to {_median(with_air):.1f} mm.",
         markdown_table(head, table),
         note=f"A cloth of {_SIDE:g} × {_SIDE:g} m hangs from a bar. An arm swings the bar three or four times and stops; "
@@ -443,10 +444,10 @@ def _page(rows: Sequence[Row], swings: Mapping[str, tuple[float, float]], figure
                     "- **Pose.** Each recording has a shift, a rotation and one lag of all frames (prior "
                     f"{1e3 * _LATE:g} ms).",
                     "- **Fit.** Gauss–Newton with the simulator's own derivatives. Bending and damping are nuisance "
-                    "parameters. The density of the cloth is unknown, so only ratios to it are found.",
+                    "parameters. The density of the cloth is unknown, so the fit only finds ratios to it.",
                     "- **Added density.** In the second row, the period of the free swing in the three recordings "
                     "determines the added density, and their clouds determine the rest. In the third row, the clouds "
-                    "determine both.",
+                    "determine the added density too.",
                 ],
                 "`studies/hanging_cloth.py` describes the recordings, which are not part of this repository.",
             ],

@@ -193,8 +193,8 @@ def pose_page(rows: Sequence[Sequence[str]], recordings: Sequence[dict[str, Any]
         f"joint log is {1e3 * recorded.clock_offset_s:g} ms late. `diffcloud data preprocess` refines cameras and clock: "
         f"the worse camera ends {np.median(shifts):.1f} mm from its place in the median and {max(shifts):.1f} mm at "
         f"most, the log within {np.median(late):.1f} ms and {max(late):.1f} ms. Then stretching is fitted with known "
-        "density.\n\nThe cloth starts as the scene says (`--initial-state none`), with its turn fitted too "
-        f"(`--initial-state {_TURN}`, the default), or as the first frame shows it. *Start*: RMS distance and angle "
-        "between the fitted starting positions of the nodes and the true ones as seen in the clouds.",
+        "density.\n\nThe page compares three initial states: that of the scene (`--initial-state none`), the same with a "
+        f"fitted rotation of the cloth (`--initial-state {_TURN}`, the default), and that of the first frame. *Start*: RMS "
+        "distance and angle between the fitted starting positions of the nodes and the true ones as seen in the clouds.",
         command="make moved",
     )

@@ -34,7 +34,7 @@ class Recording:
 
 
 def compared(record: FitRecord, recordings: Sequence[Recording]) -> AnyObjective:
-    """Return the objective of a finished fit, at the frames in its record.
+    """Return the `Objective` with which a finished fit was made, for the frames that its record lists.
 
     Args:
         recordings: recordings of the fit, in the same order.

@@ -115,8 +115,8 @@ def _aligned_flat(
 ) -> tuple[float, Floats, float]:
     """Align a flat mesh with a cloud, both at height 0, by translation and rotation.
 
-    Points of the mesh do not count if a point of the cloud is as near as its spacing, or if a hand may hide them. So only
-    the outline aligns.
+    Points of the mesh are ignored if a point of the cloud is within the spacing of the cloud, or if a gripper may hide
+    them. So only the outline aligns.
 
     Args:
         hands: [G, 3] places of the grippers.

@@ -20,7 +20,7 @@ from diffcloud.mesh.topology import ClothMesh, FloatArray, IntArray, SurfaceMesh
 _CREASE = np.cos(np.deg2rad(60.0))
 """Cosine of the angle between the normals of two faces, below which their edge is kept as a line."""
 _CORNER = np.cos(np.deg2rad(35.0))
-"""Cosine of the turn of a line, below which its node is kept."""
+"""Cosine of 35 degrees. A node is kept where an outline or crease changes its direction by more than this."""
 _DENSE = 0.2
 """Largest mean edge length of the mesh on which distances are measured, as a fraction of the wanted one."""
 _ALONG = 0.6

@@ -59,7 +59,7 @@ class GridScenario(ScenarioOptions):
     grip_m: Length = GRIP_M
     """Side of the pad, or of the square that a pivot represents."""
     grip_known_within: Annotated[float, Field(ge=1, le=3)] = 1.0
-    """Standard deviation of `grip_m` as a factor; 1: exact. Fits by `likelihood` take it into account."""
+    """Standard deviation of `grip_m`, as a factor. With 1, `grip_m` is exact. Fits by `likelihood` take it into account."""
     loss_surface: Literal["all", "grasped_half"] = "all"
     initial_state: Annotated[str, Field(max_length=200)] = "turn=10deg"
     """Standard deviations of the deviations from the initial state, which fits estimate: `turn` about the cloth's

@@ -84,7 +84,7 @@ class MeshScenario(ScenarioOptions):
     grip_m: Length = GRIP_M
     """Side of the pad, or of the square that a pivot represents."""
     grip_known_within: Annotated[float, Field(ge=1, le=3)] = 1.0
-    """Standard deviation of `grip_m` as a factor; 1: exact. Fits by `likelihood` take it into account."""
+    """Standard deviation of `grip_m`, as a factor. With 1, `grip_m` is exact. Fits by `likelihood` take it into account."""
 
     @property
     def own_paths(self) -> Mapping[str, Keyframes]:
