@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import inspect
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import fields, is_dataclass
@@ -22,6 +23,9 @@ def fingerprint(plan: Any, *, packages: Sequence[str]) -> str:
     Args:
         plan: settings and data: dataclasses, mappings, sequences, arrays, numbers, strings.
         packages: sub-packages of diffcloud whose source code affects the result.
+
+    Raises:
+        TypeError: a value of the plan is known only by its address in memory.
     """
     digest = hashlib.sha256()
     for package in packages:
@@ -51,4 +55,8 @@ def _described(value: Any) -> Any:
         return {str(key): _described(entry) for key, entry in value.items()}
     if isinstance(value, Sequence) and not isinstance(value, str):
         return [_described(entry) for entry in value]
-    return repr(value)
+    if inspect.isroutine(value):
+        return f"{value.__module__}.{value.__qualname__}"
+    if " at 0x" in (text := repr(value)):
+        raise TypeError(f"{text} has no fingerprint: it is known by its address in memory, which each process changes.")
+    return text

@@ -394,7 +394,7 @@ def test_a_scheduler_that_dies_loses_no_finished_fit(tree, tmp_path_factory):
         os.killpg(cluster.pid, signal.SIGKILL)
         _, said = process.communicate(timeout=120)
     assert process.returncode == 1, said
-    assert "What is finished is kept; run the command again" in " ".join(said.split())
+    assert "Finished results are kept. Run the command again." in " ".join(said.split())
     finished = {path.stem: path.stat().st_mtime_ns for path in (tree / "fits" / "small").glob("e*.json")}
     assert 1 <= len(finished) < 5
     staged(*FIT, cwd=tree)
