@@ -3,7 +3,7 @@ here imports torch, so that `--help` is fast."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Self, get_args
 
 from pydantic import Field, field_validator, model_validator
@@ -128,17 +128,9 @@ class FitSettings(Section):
 
     @model_validator(mode="after")
     def _ordered(self) -> Self:
-        from diffcloud.estimation.pose import parse_priors
-        from diffcloud.scene.scenarios.initial_state import parse_initial_state
-        from diffcloud.scene.scenarios.uncertain import parse_uncertain
-
         for name, pair in self.bounds.items():
             check_bounds(f"bounds.{name}", pair)
-        parse_priors(self.alignment or "none")
-        initial_state, uncertain = (
-            parse_initial_state(self.initial_state or "none"),
-            parse_uncertain(self.uncertain or "none"),
-        )
+        initial_state, uncertain = self._parsed()
         if self.loss != "paper":
             return self
         if initial_state:
@@ -148,6 +140,20 @@ class FitSettings(Section):
         if self.solver.name == "likelihood":
             raise ValueError("loss: the paper's loss has no likelihood; choose another solver, such as adam")
         return self
+
+    def _parsed(self) -> tuple[Mapping[str, float], Mapping[str, float]]:
+        """Parse `alignment`, `initial_state` and `uncertain`, and return the last two.
+
+        If none of them is stated, the configuration is read without torch.
+        """
+        if {self.alignment, self.initial_state, self.uncertain} <= {None, "none"}:
+            return {}, {}
+        from diffcloud.estimation.pose import parse_priors
+        from diffcloud.scene.scenarios.initial_state import parse_initial_state
+        from diffcloud.scene.scenarios.uncertain import parse_uncertain
+
+        parse_priors(self.alignment or "none")
+        return parse_initial_state(self.initial_state or "none"), parse_uncertain(self.uncertain or "none")
 
     @property
     def paper(self) -> bool:

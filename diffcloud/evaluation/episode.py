@@ -11,34 +11,15 @@ from diffcloud.estimation.names import of_recording
 from diffcloud.estimation.objective import Objective
 from diffcloud.estimation.parameters import FitSpace
 from diffcloud.estimation.record import FitRecord
-from diffcloud.estimation.settings import IDENTIFIED_FACTOR, LEVEL
 from diffcloud.estimation.solvers import AdamSettings, CmaEsSettings, RandomSearchSettings
 from diffcloud.evaluation import methods
 from diffcloud.evaluation.intervals import intervals_of
 from diffcloud.evaluation.landscape import loss_landscape
-from diffcloud.evaluation.methods import Baseline, Estimate, Gap
+from diffcloud.evaluation.methods import Estimate, Gap
 from diffcloud.evaluation.metrics import EpisodeMeter, success_threshold
+from diffcloud.evaluation.settings import Baseline, ComparisonSettings
 from diffcloud.io.episodes import Episode
 from diffcloud.scene.scenarios import Scenario
-
-BASELINES: tuple[Baseline, ...] = ("single_start", "middle", "random_search", "cma_es")
-
-
-@dataclass(frozen=True)
-class ComparisonSettings:
-    """Settings of `compare_episode`."""
-
-    baselines: Sequence[Baseline] = BASELINES
-    draws: int = 4
-    """Number of new point samples over which losses are averaged."""
-    seed: int = 1000
-    """Seed of the first sample, and of the searches."""
-    level: float | None = LEVEL
-    """Probability of the intervals; None: no intervals."""
-    within: float = IDENTIFIED_FACTOR
-    """Factor within which a parameter counts as identified."""
-    landscape_size: int = 0
-    """Number of points along each axis of the loss landscape; 0: none."""
 
 
 @dataclass(frozen=True)

@@ -29,8 +29,6 @@ from diffcloud.estimation.solvers import (
     solve,
 )
 
-Baseline = Literal["single_start", "middle", "random_search", "cma_es"]
-"""Baselines that the comparison runs itself."""
 Phase = Literal["dataset", "training", "inference", "optimisation"]
 PHASES: tuple[Phase, ...] = ("dataset", "training", "inference", "optimisation")
 

@@ -12,9 +12,10 @@ import pandas as pd
 
 from diffcloud.errors import CheckpointError, DiffCloudError, EpisodeError
 from diffcloud.estimation.record import FitRecord, read_fit
-from diffcloud.evaluation import ComparisonSettings, EpisodeRecord, Estimate, Gap, compare_episode
-from diffcloud.evaluation.methods import predicted
+from diffcloud.evaluation.episode import EpisodeRecord, compare_episode
+from diffcloud.evaluation.methods import Estimate, Gap, predicted
 from diffcloud.evaluation.repeats import other_repeats
+from diffcloud.evaluation.settings import ComparisonSettings
 from diffcloud.evaluation.summary import PREDICTORS
 from diffcloud.io.episodes import Episode, read_episode
 from diffcloud.io.files import files_in, write_json, write_text

@@ -10,7 +10,7 @@ from pydantic import Field, ValidationError, model_validator
 
 from diffcloud.errors import ConfigError
 from diffcloud.estimation.settings import FitSettings
-from diffcloud.evaluation import BASELINES, Baseline, ComparisonSettings
+from diffcloud.evaluation.settings import BASELINES, Baseline, ComparisonSettings
 from diffcloud.io.files import read_yaml
 from diffcloud.io.raw_episodes import ScenePlacement
 from diffcloud.io.schema import Component, NonNegative, Positive, explain

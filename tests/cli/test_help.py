@@ -14,6 +14,7 @@ from diffcloud.cli.data import COMMANDS as DATA
 from diffcloud.cli.network import COMMANDS as NETWORK
 from diffcloud.regressors import MODEL_NAMES, PROFILE_NAMES
 from diffcloud.scene.scenarios import SCENARIO_NAMES
+from tests.docs.examples import ROOT
 
 LEAVES = [[name] for name in COMMANDS if name not in ("data", "network")]
 LEAVES += [["data", name] for name in DATA] + [["network", name] for name in NETWORK]
@@ -34,6 +35,15 @@ def test_help_imports_no_large_library():
     lengths, modules = json.loads(done.stdout)
     assert min(lengths) > 200
     assert not HEAVY & set(modules)
+
+
+def test_settings_are_read_without_the_simulator():
+    code = (
+        "import sys; from pathlib import Path; from diffcloud.jobs.settings import load_config\n"
+        "load_config(Path('params.yaml')); print(*sorted({'torch', 'numba', 'open3d'} & set(sys.modules)))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == ""
 
 
 def test_a_group_shows_the_first_paragraph_of_each_command():

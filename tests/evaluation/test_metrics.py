@@ -16,8 +16,11 @@ from diffcloud.estimation.parameters import FitSpace
 from diffcloud.estimation.record import History
 from diffcloud.estimation.result import describe_fit
 from diffcloud.estimation.solvers import AdamSettings, RandomSearchSettings, fit_adam, solve
-from diffcloud.evaluation import ComparisonSettings, EpisodeMeter, Estimate, Gap, compare_episode, loss_landscape
-from diffcloud.evaluation.metrics import success_threshold
+from diffcloud.evaluation.episode import compare_episode
+from diffcloud.evaluation.landscape import loss_landscape
+from diffcloud.evaluation.methods import Estimate, Gap
+from diffcloud.evaluation.metrics import EpisodeMeter, success_threshold
+from diffcloud.evaluation.settings import ComparisonSettings
 from diffcloud.io.episodes import Episode
 from tests.conftest import paper_objective, small_lift
 from tests.estimation.test_fit import clouds_of
