@@ -36,15 +36,15 @@ def import_(
     gripper: Annotated[
         list[str] | None,
         typer.Option(
-            help="Clouds: CSV with x, y, z in metres and optionally t_s, one row a frame. Several grippers: one CSV with a "
-            "column gripper, or NAME=PATH for each."
+            help="Clouds: CSV with x, y, z in metres and optionally t_s, one row per frame. Several grippers: one CSV with "
+            "a column gripper, or NAME=PATH for each."
         ),
     ] = None,
     rate_hz: Annotated[
         float | None,
         typer.Option(
-            help="Clouds, depth folders: frame rate, if neither a CSV nor the file names have times. Names that are times "
-            "must agree."
+            help="Clouds, depth folders: frame rate, if neither a CSV nor the file names have times. If the file "
+            "names are times, a given rate must agree with them."
         ),
     ] = None,
     camera: Annotated[

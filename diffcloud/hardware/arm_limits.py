@@ -141,8 +141,8 @@ class ArmChecker:
             raise LimitError(f"The arm reports no numbers for its joints or its tool: {reading}.")
         if len(reading.joints_rad) != len(self._ends):
             raise LimitError(
-                f"The arm has {len(reading.joints_rad)} joints, the description {self.robot.description.name} has "
-                f"{len(self._ends)}: name the description of this arm, urdf in rig.yaml."
+                f"The arm has {len(reading.joints_rad)} joints, but the URDF {self.robot.description.name} has "
+                f"{len(self._ends)}. Set `urdf` in rig.yaml to the URDF of this arm."
             )
         reported, expected = _rotation(reading), self.robot.tool_pose(reading.joints_rad)
         offset = reported.inv().apply(expected[:3, 3] - reading.tool_position_m)

@@ -147,7 +147,7 @@ def find_hanging(episode: Episode, cloth: Mapping[str, Any]) -> Layout:
     scores = "; ".join(one.words for one in tried)
     if not tried or tried[0].rms_m > WORST_M:
         raise EpisodeError(
-            f"The first cloud is not that of a cloth of {' x '.join(f'{x:g}' for x in cloth['size_m'])} m that hangs at "
+            f"The first cloud does not match a cloth of {' x '.join(f'{x:g}' for x in cloth['size_m'])} m that hangs at "
             f"rest. RMS distances: {scores}; at most {1e3 * WORST_M:.0f} mm are allowed. Check --size, that clouds and "
             "gripper are in metres in one frame with z up, and that the cloud shows the whole cloth and nothing else."
         )

@@ -94,7 +94,7 @@ def _array(stream: BinaryIO, size: int, name: str) -> NDArray[Any]:
     except ValueError as damage:
         raise ValueError(f"{name} has no header of an array ({damage})") from damage
     if not readable(dtype):
-        raise ValueError(f"{name} holds {dtype} elements, which may be numbers, or text of a letter or more")
+        raise ValueError(f"{name} has elements of type {dtype}; only numbers and non-empty strings are allowed")
     there = size - stream.tell()
     if len(shape) > MOST_DIMENSIONS or any(extent < 0 for extent in shape):
         raise ValueError(f"{name} has the shape {list(shape)}")

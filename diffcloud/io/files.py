@@ -330,7 +330,7 @@ def _refuse_twice(node: yaml.Node | None, path: Path, error: type[DiffCloudError
             for key, value in one.value:
                 if isinstance(key, yaml.ScalarNode) and key.value in keys:
                     raise error(
-                        f"{path}, line {key.start_mark.line + 1}: {key.value!r} stands there twice; keep one of them."
+                        f"{path}, line {key.start_mark.line + 1}: the key {key.value!r} occurs twice; keep one of them."
                     )
                 keys.add(str(key.value))
                 open_nodes += [key, value]

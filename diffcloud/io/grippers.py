@@ -48,8 +48,8 @@ def tracks_beside(folder: Path) -> dict[str, Path]:
         return {path.stem.removeprefix("gripper_"): path for path in several}
     if not several:
         raise EpisodeError(
-            f"{folder} holds no gripper.csv with the columns t_s, x, y, z [m], one row a frame. For several grippers, give "
-            "one file each, such as gripper_left.csv and gripper_right.csv."
+            f"{folder} holds no gripper.csv with the columns t_s, x, y, z [m], one row per frame. For several grippers, "
+            "give one file each, such as gripper_left.csv and gripper_right.csv."
         )
     found = ", ".join(path.name for path in (*filter(Path.is_file, [single]), *several))
     raise EpisodeError(
@@ -94,7 +94,10 @@ def read_tracks(files: Mapping[str, Path], frames: int, stamps: NDArray[np.float
         positions.append(track)
         if own is not None:
             if times is not None and np.abs(own - times).max() > _SAME_TIME_S:
-                raise EpisodeError(f"{place}: its times differ from those of the other grippers; give one row a frame.")
+                raise EpisodeError(
+                    f"{place}: its times differ from those of the other grippers. Give one row per frame, with the same "
+                    "times for all grippers."
+                )
             times = own
     return GripperTracks(tuple(tables), np.stack(positions, axis=1), None if times is None else times - times[0])
 
@@ -113,7 +116,7 @@ def _interpolated(
     """
     if times is None or stamps is None:
         raise EpisodeError(
-            f"{place} has {len(track)} rows for {frames} clouds. Give one row a frame, or a column t_s and clouds whose "
+            f"{place} has {len(track)} rows for {frames} clouds. Give one row per frame, or a column t_s and clouds whose "
             "names are times on the same clock."
         )
     if (np.diff(times) < 0).any():

@@ -83,8 +83,8 @@ def recorded_episode(kind: str, name: str, published: Episode, track: NDArray[np
     """
     if len(track) != published.frame_count:
         raise EpisodeError(
-            f"{kind}_traj.npy has {len(track)} rows, but {name} has {published.frame_count} clouds; a track has one row a "
-            "cloud."
+            f"{kind}_traj.npy has {len(track)} rows, but {name} has {published.frame_count} clouds; a track has one row "
+            "per cloud."
         )
     meta = {name: value for name, value in published.meta.items() if name != "predictions"}
     points = RELEASE_UNIT_M * published.points.astype(np.float64)

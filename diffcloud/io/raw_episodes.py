@@ -97,7 +97,7 @@ def _depth_scale(scale: float) -> float:
         ValueError: the scale is outside the range of depth cameras.
     """
     if not 1e-6 <= scale <= 0.02:
-        raise ValueError("it is metres per unit of the image, for a D435 0.001 (one millimetre)")
+        raise ValueError("it must be from 1e-6 to 0.02 metres per unit of the depth image; a D435 has 0.001")
     return scale
 
 

@@ -324,8 +324,8 @@ def _tracks(folder: Path, trajectories: Path) -> dict[str, NDArray[np.float64]]:
     kinds = tuple(kind for kind, name in folders.items() if (folder / name).is_dir())
     if not kinds:
         raise ConfigError(
-            f"{folder} holds neither {' nor '.join(folders.values())}, to which the trajectories belong; give the folder "
-            "that does, or leave --trajectories out."
+            f"{folder} has neither {' nor '.join(folders.values())}, the recordings to which --trajectories belongs. "
+            "Give the folder that has one of them, or leave --trajectories out."
         )
     return read_trajectories(trajectories, kinds)
 

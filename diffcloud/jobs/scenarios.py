@@ -75,7 +75,7 @@ def fitted_scenario(fit: Path, name: str) -> str:
     if here.is_file():
         return str(here)
     raise ConfigError(
-        f"{fit} is a fit in the scenario {name}, which is not known here. Put its YAML file into {fit.parent}/scenes/."
+        f"{fit} was fitted with the scenario {name}, which was not found. Put its YAML file into {fit.parent}/scenes/."
     )
 
 

@@ -94,7 +94,9 @@ def viewpoints(path: Path, scenarios: Sequence[str]) -> list[list[float]]:
     if own is not None and any(name != own for name in scenarios):
         raise ConfigError(f"--like {path} is a recording of {own}, not of {', '.join(scenarios)}; add --scene {own}.")
     if not episode.viewpoints:
-        raise EpisodeError(f"{path} does not say where its cameras stood; take one that `diffcloud data preprocess` wrote.")
+        raise EpisodeError(
+            f"{path} has no camera positions (`viewpoints`). Use an episode that `diffcloud data preprocess` wrote."
+        )
     return [place.tolist() for place in episode.viewpoints.values()]
 
 

@@ -186,7 +186,7 @@ class ClothMesh:
         flat = np.flatnonzero(np.abs(self.face_area) <= smallest)
         if len(flat):
             raise MeshError(
-                f"Face {flat[0]} has no area in material space (vt); the rest shape of a cloth comes from there. "
+                f"Face {flat[0]} has no area in material space (vt), which defines the rest shape of the cloth. "
                 "Unwrap the mesh again."
             )
         turned = np.flatnonzero(self.face_area < 0)

@@ -269,7 +269,8 @@ def joints_at(log: RobotLog, times: Floats, *, clock_offset_s: float = 0.0) -> t
     if times[0] < clock[0] - _OUTSIDE_S or times[-1] > clock[-1] + _OUTSIDE_S:
         raise EpisodeError(
             f"The joint log covers {clock[0]:.2f} to {clock[-1]:.2f} s, the images {times[0]:.2f} to {times[-1]:.2f} s: "
-            "where the robot was is not known for all of them. Cut the video, or import the whole log (--clock-offset)."
+            "the robot's pose is unknown for some images. Trim the images, import the complete log, or correct the log's "
+            "times with --clock-offset."
         )
     continuous = np.unwrap(log.joints_rad, axis=0)  # arms report angles within one turn
     joints = np.stack([np.interp(times, clock, column) for column in continuous.T], axis=1)

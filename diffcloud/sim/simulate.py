@@ -192,7 +192,7 @@ def _inputs(system: System, steps: int, properties: Properties, state: State, tr
     given = [positions, velocities, poses, *properties.tensors()]
     for (name, shape), tensor in zip(expected.items(), given, strict=True):
         if tuple(tensor.shape[1:]) != tuple(shape):  # kernels do not check array bounds
-            raise SceneError(f"{name} has shape [batch, {', '.join(map(str, shape))}] here, got {list(tensor.shape)}.")
+            raise SceneError(f"{name} must have shape [batch, {', '.join(map(str, shape))}], got {list(tensor.shape)}.")
     return [positions, velocities, poses, track, *properties.tensors()]
 
 

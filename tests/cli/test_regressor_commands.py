@@ -130,9 +130,7 @@ def test_train_then_predict(work):
 
 def test_clouds_show_what_the_cameras_of_a_recording_see(work, monkeypatch):
     plain = read_episode(work / "data/episodes/small/e1.npz")
-    assert "does not say where its cameras stood" in str(
-        run(*TRAIN, "--like", "data/episodes/small/e1.npz", code=1).exception
-    )
+    assert "has no camera positions" in str(run(*TRAIN, "--like", "data/episodes/small/e1.npz", code=1).exception)
     viewpoints = {"side": [0.5, -1.0, 0.7], "top": [0.0, 0.0, 2.0]}
     write_episode(work / "other.npz", replace(plain, meta={"scenario": "lift", "viewpoints": viewpoints}))
     assert "a recording of lift, not of small; add --scene lift" in str(

@@ -200,7 +200,7 @@ class TestToolFrame:
     def test_no_numbers_and_another_arm(self):
         with pytest.raises(LimitError, match="no numbers"):
             checker().check_tool_frame(replace(reading(), tool_position_m=np.full(3, np.nan)))
-        with pytest.raises(LimitError, match="6 joints, the description gen3_robotiq_2f_85 has 7"):
+        with pytest.raises(LimitError, match="6 joints, but the URDF gen3_robotiq_2f_85 has 7"):
             checker().check_tool_frame(replace(reading(), joints_rad=np.zeros(6)))
 
 

@@ -228,7 +228,7 @@ class TestBadTracks:
     def test_no_recording_that_they_belong_to(self, published):
         for kind in NAMES:
             (published / "pysim" / f"{kind}_real_pcls").rename(published / kind)
-        self.check(published, "holds neither lift_real_pcls nor fold_real_pcls")
+        self.check(published, "has neither lift_real_pcls nor fold_real_pcls")
 
     def test_a_damaged_cloud_after_whole_ones(self, published):
         (published / "pysim" / "fold_real_pcls" / "fold_tan" / "013.npy").write_bytes(b"not a cloud")

@@ -143,8 +143,8 @@ class TestText:
     @pytest.mark.parametrize(
         ("text", "message"),
         [
-            ("a: 1\nb: {c: 1}\na: 2\n", "line 3: 'a' stands there twice"),
-            ("- {b: 1, b: 1}\n", "line 1: 'b' stands there twice"),
+            ("a: 1\nb: {c: 1}\na: 2\n", "line 3: the key 'a' occurs twice"),
+            ("- {b: 1, b: 1}\n", "line 1: the key 'b' occurs twice"),
             ("[" * 100_000 + "]" * 100_000, "is not readable YAML"),
         ],
     )

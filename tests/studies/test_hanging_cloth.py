@@ -143,7 +143,7 @@ def test_a_page_says_what_was_found():
     rms = dict.fromkeys(study.FITTED, 12.0) | {"other": 11.0, "another": 13.0}
     rows = [study.Row(model, VALUES, rms, 1.1, 0.7) for model in models]
     page = study._page(rows, dict.fromkeys(rms, (1.09, 0.8)), "x.png")
-    assert "period of 1.090 s (median of 5)" in page
+    assert "period of 1.090 s (median of 5 swings)" in page
     assert "The median RMS of the 2 predicted recordings falls from 12.0 to 12.0 mm." in page
     assert "| air_density alone | 12.0 | 12.0 | 12.0 | 12.0 | 1.100 | 0.70 | 0.40 | 0.80 | 3.60 |" in page
     check_form(page)

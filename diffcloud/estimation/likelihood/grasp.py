@@ -50,8 +50,8 @@ def gripped(members: Sequence[Objective], grip: float) -> Sequence[Objective]:
 
 
 def that_fits(members: Sequence[Objective], grip: float) -> float:
-    """Return the largest fraction of a change in grasp size for which the gripper pad fits on the cloth and the mesh.
-    The fractions are 1, 3/4, 1/2 and 1/4. If none fits, the result is 0."""
+    """Return a change in grasp size [standard deviations], reduced until the gripper pad fits on the cloth and the mesh.
+    The whole change is tried, then 3/4, 1/2 and 1/4 of it. If none fits, the result is 0."""
     for part in (1.0, 0.75, 0.5, 0.25):
         try:
             for one in members:

@@ -185,7 +185,9 @@ def _places(options: GridScenario, names: Sequence[str | int]) -> list[int]:
             raise SceneError(f"Scenario {options.name}: " + unknown_name("corner", name, corners))
         node = corners[name] if isinstance(name, str) else name
         if not 0 <= node < rows * columns:
-            raise SceneError(f"Scenario {options.name}: node {node} does not exist, the cloth has 0..{rows * columns - 1}.")
+            raise SceneError(
+                f"Scenario {options.name}: node {node} does not exist. The cloth has nodes 0 to {rows * columns - 1}."
+            )
         nodes.append(node)
     return nodes
 

@@ -187,7 +187,8 @@ class Scenario:
         )
 
     def value(self, name: str) -> float:
-        """Return a parameter's simulator input in this scenario (1 for multipliers); zero if it has no effect."""
+        """Return the scenario's own value of a parameter, as the simulator takes it (1 for multipliers). The result is 0 if
+        the parameter has no effect."""
         quantity = PARAMETERS[name].quantity
         if quantity is not None:
             return 1.0 if self.scene.nominal(quantity) > _NO_MATERIAL else 0.0

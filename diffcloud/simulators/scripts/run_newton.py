@@ -70,8 +70,9 @@ def add_cloth(builder, cloth, explicit=False):
 def finish_cloth(model, cloth, explicit=False):
     """Set properties that a builder does not accept: friction of the cloth, and stiffness and rest angle of each edge.
 
-    The energy of an edge is K θ²/2. VBD uses k l θ²/2, so k = K/l. The explicit solver applies the force k l² θ, where
-    the gradient of θ would need K θ/height. So k = K/(l (a0 + a1)) for two faces of the same size.
+    The energy of an edge is K θ²/2. VBD uses k l θ²/2, so k = K/l. The explicit solver applies the force k l² θ, but the
+    gradient of the energy is K θ/h, where h is a face's height over the edge. So k = K/(l (a0 + a1)) for two faces of
+    the same size.
     """
     model.particle_grid = None  # no repulsion between nodes as spheres
     model.soft_contact_mu, model.soft_contact_ke = float(cloth["friction"]), CONTACT_STIFFNESS
