@@ -136,7 +136,8 @@ def _rigid(rows: list[list[float]]) -> list[list[float]]:
     off = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
     if off > 1e-4 or np.linalg.det(rotation) < 0 or np.abs(matrix[3] - [0, 0, 0, 1]).max() > 1e-9:
         raise ValueError(
-            f"it is not a rigid transform (R Rᵀ differs from the identity by up to {off:.2g}); give [R t; 0 0 0 1] with det R = 1"
+            f"it is not a rigid transform (R Rᵀ differs from the identity by up to {off:.2g}); give [R t; 0 0 0 1] "
+            "with det R = 1"
         )
     if np.abs(matrix[:3, 3]).max() > 20:
         raise ValueError(f"it puts the camera {np.abs(matrix[:3, 3]).max():.0f} m away; translations are metres")

@@ -59,7 +59,7 @@ class TestArrays:
         np.savez(path, a=np.zeros(3))
         self.refused(path, "it lacks b", names=("a", "b"))
         np.savez(path, a=np.array([{}], dtype=object))
-        self.refused(path, "holds object elements")
+        self.refused(path, "has elements of type object")
 
     @pytest.mark.parametrize("cut", [0.3, 0.6, 0.95])
     def test_a_deflate_stream_that_is_cut_or_damaged(self, path, cut, rng):
