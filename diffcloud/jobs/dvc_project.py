@@ -9,6 +9,7 @@ from pathlib import Path
 
 from diffcloud.console import errors
 from diffcloud.errors import ConfigError
+from diffcloud.estimation.likelihood.settings import LikelihoodSettings
 from diffcloud.estimation.record import FitRecord, read_fit
 from diffcloud.estimation.settings import LEVEL
 from diffcloud.evaluation.intervals import read_intervals
@@ -126,4 +127,8 @@ def _options(folder: Path, record: FitRecord) -> str:
     told = read_intervals(folder / "intervals.json", space_of(record).asked)
     if told.level != LEVEL:
         options += ["--level", f"{told.level:g}"]
+    usual = LikelihoodSettings()
+    for name, value in (("starts", usual.starts), ("max_steps", usual.max_steps)):
+        if record.settings.get(name, value) != value:
+            options += [f"--{name.replace('_', '-')}", str(record.settings[name])]
     return shlex.join(options)
