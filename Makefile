@@ -54,7 +54,7 @@ test-slow: venv
 	$(TESTS) -m "slow and not realtime"
 	python -m pytest -m realtime tests/hardware
 
-# minutes each on a slow machine: the lag in sixteen recordings, identifying two more MuJoCo towels, and an export that Newton runs
+# minutes each on a slow machine: the lag in sixteen recordings, fits of MuJoCo towels, damaged files of each kind, an export that Newton runs
 test-longest: venv
 	$(TESTS) -m longest
 

@@ -2,8 +2,9 @@
 
 numba compiles a kernel on its first call and stores the machine code in the user's cache folder. The subfolder is named
 after a fingerprint of all kernel sources. numba itself checks only a function's own file, not the functions that it
-calls. So an upgrade compiles again and never mixes versions. Several processes may compile at once, since files are
-written atomically. When a new subfolder is created, those of other versions that were unused for 30 days are removed.
+calls. So an upgrade compiles again and never mixes versions, and all installations of one version share the code. Several
+processes may compile at once, since files are written atomically. When a new subfolder is created, those of other
+versions that were unused for 30 days are removed.
 
 `DIFFCLOUD_CACHE_DIR` sets the cache folder. `DIFFCLOUD_UNCOMPILED=1` runs all kernels as plain Python, for a debugger.
 A step then takes seconds.

@@ -11,10 +11,12 @@ from __future__ import annotations
 import inspect
 from collections import Counter
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 from numba import njit
 from numba.core import ir
+from numba.core.caching import CompileResultCacheImpl, FunctionCache, UserProvidedCacheLocator
 from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import CompilerBase, DefaultPassBuilder
 from numba.core.compiler_machinery import PassManager, register_pass
@@ -22,6 +24,7 @@ from numba.core.lowering import Lower
 from numba.core.registry import CPUDispatcher
 from numba.core.typed_passes import NativeLowering
 
+_PACKAGE = Path(__file__).resolve().parent
 _LARGE = 8
 """A kernel that calls more kernels than this is not optimised with them, since each is optimised already."""
 
@@ -35,7 +38,8 @@ class LinkedKernel(CPUDispatcher):
             targetoptions=options | {"nopython": True, "no_cpython_wrapper": True},
             pipeline_class=_LinkedCompiler,
         )
-        self._entry = njit(cache=True, pipeline_class=_EntryCompiler, **options)(_calling(self, function))
+        self._entry = njit(pipeline_class=_EntryCompiler, **options)(_calling(self, function))
+        self._entry._cache = _KernelCache(self._entry.py_func)
 
     def __call__(self, *given: Any, **named: Any) -> Any:
         return self._entry(*given, **named)
@@ -43,6 +47,25 @@ class LinkedKernel(CPUDispatcher):
     def add_overload(self, compiled: Any) -> None:
         """Add a compiled overload without registering it for calls from Python."""
         self.overloads[tuple(compiled.signature.args)] = compiled
+
+
+class _Locator(UserProvidedCacheLocator):
+    """Places cached code by the path of a kernel within the package. So all installations of one version share it."""
+
+    @classmethod
+    def get_suitable_cache_subpath(cls, py_file: str) -> str:
+        """Return the subfolder for the code of a source file. Files outside of the package have numba's own."""
+        folder = Path(py_file).resolve().parent
+        inside = folder.is_relative_to(_PACKAGE)
+        return str(folder.relative_to(_PACKAGE) if inside else super().get_suitable_cache_subpath(py_file))
+
+
+class _KernelCacheImpl(CompileResultCacheImpl):
+    _locator_classes = (_Locator, *CompileResultCacheImpl._locator_classes)
+
+
+class _KernelCache(FunctionCache):
+    _impl_class = _KernelCacheImpl
 
 
 def _calling(linked: LinkedKernel, function: Callable[..., Any]) -> Callable[..., Any]:

@@ -23,8 +23,8 @@ DAY = 86400
 def run(tmp_path):
     """Run a program with a cache folder of its own."""
 
-    def started(*command):
-        env = {**os.environ, "PYTHONPATH": str(ROOT), "DIFFCLOUD_CACHE_DIR": str(tmp_path / "cache")}
+    def started(*command, root=ROOT):
+        env = {**os.environ, "PYTHONPATH": str(root), "DIFFCLOUD_CACHE_DIR": str(tmp_path / "cache")}
         env.pop("DIFFCLOUD_UNCOMPILED", None)
         done = subprocess.run(command, cwd=tmp_path, env=env, capture_output=True, text=True, timeout=600)
         assert done.returncode == 0, done.stderr
@@ -56,10 +56,13 @@ def test_doctor_compiles_what_is_missing(run, tmp_path):
     assert doctor() == after
 
 
-def test_first_use_says_once_that_it_compiles(run):
-    use = (sys.executable, "-c", "from diffcloud.clouds import neighbours; neighbours.compile_neighbours()")
-    assert run(*use).stderr.count("Compiling kernels") == 1
-    assert run(*use).stderr == ""
+def test_first_use_says_once_that_it_compiles_for_all_installations_of_a_version(run, tmp_path):
+    shutil.copytree(ROOT / "diffcloud", tmp_path / "other" / "diffcloud", ignore=shutil.ignore_patterns("__pycache__"))
+    use = "from diffcloud.clouds import neighbours as n; n.compile_neighbours(); print(n.__file__)"
+    assert run(sys.executable, "-c", use).stderr.count("Compiling kernels") == 1
+    done = run(sys.executable, "-c", use, root=tmp_path / "other")
+    assert str(tmp_path / "other") in done.stdout
+    assert done.stderr == ""
 
 
 def test_compile_all_tells_its_progress(monkeypatch, tmp_path):

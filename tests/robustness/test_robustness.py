@@ -12,8 +12,6 @@ from tests.robustness import damage
 from tests.robustness.isolated import read_alone
 from tests.robustness.kinds import KINDS
 
-pytestmark = pytest.mark.slow
-
 
 def tried(*arguments: object) -> None:
     command = [sys.executable, "-m", "tests.robustness", *map(str, arguments)]
@@ -21,15 +19,18 @@ def tried(*arguments: object) -> None:
     assert done.returncode == 0, done.stdout + done.stderr[-3000:]
 
 
+@pytest.mark.longest
 def test_a_sample_of_damaged_files_and_a_disturbed_command():
     """One of each kind of file; one disturbance of a command."""
     tried("--only", "inputs", "--only", "faults", "--sample", 1, "--sample-faults", 1, "--command", "fit", "--workers", 2)
 
 
+@pytest.mark.slow
 def test_a_moving_arm_is_stopped_and_what_was_recorded_is_kept():
     tried("--only", "arm", "--sample", 6)
 
 
+@pytest.mark.slow
 class TestTheSuiteItself:
     """It must see what it looks for."""
 
