@@ -61,7 +61,7 @@ class _Locator(UserProvidedCacheLocator):
 
 
 class _KernelCacheImpl(CompileResultCacheImpl):
-    _locator_classes = (_Locator, *CompileResultCacheImpl._locator_classes)
+    _locator_classes = [_Locator, *CompileResultCacheImpl._locator_classes]
 
 
 class _KernelCache(FunctionCache):
