@@ -12,7 +12,7 @@ import inspect
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 from numba import njit
 from numba.core import ir
@@ -61,7 +61,7 @@ class _Locator(UserProvidedCacheLocator):
 
 
 class _KernelCacheImpl(CompileResultCacheImpl):
-    _locator_classes = [_Locator, *CompileResultCacheImpl._locator_classes]
+    _locator_classes: ClassVar[list[type[object]]] = [_Locator, *CompileResultCacheImpl._locator_classes]
 
 
 class _KernelCache(FunctionCache):
