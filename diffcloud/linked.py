@@ -12,7 +12,7 @@ import inspect
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 from numba import njit
 from numba.core import ir
@@ -61,7 +61,9 @@ class _Locator(UserProvidedCacheLocator):
 
 
 class _KernelCacheImpl(CompileResultCacheImpl):
-    _locator_classes: ClassVar[list[type[object]]] = [_Locator, *CompileResultCacheImpl._locator_classes]
+    def __init__(self, py_func: Callable[..., Any]) -> None:
+        self._locator_classes = [_Locator, *CompileResultCacheImpl._locator_classes]
+        super().__init__(py_func)
 
 
 class _KernelCache(FunctionCache):
