@@ -94,7 +94,11 @@ class TestArrays:
 
     @pytest.mark.parametrize(
         ("kind", "shape", "message"),
-        [("<U0", (10**9,), "holds .*<U0"), ("<f8", (0, 10**30), "allowed dimension"), ("<f8", (1,) * 9, "shape")],
+        [
+            ("<U0", (10**9,), "(an array of|of type) <U0"),
+            ("<f8", (0, 10**30), "allowed dimension"),
+            ("<f8", (1,) * 9, "shape"),
+        ],
     )
     def test_a_shape_that_needs_no_bytes_takes_no_memory(self, path, kind, shape, message):
         """numpy has a letter's memory for each text without letters: four gigabytes here."""

@@ -216,7 +216,7 @@ class TestScenarios:
             ("colour: red\n", "colour: unknown"),
             ("size_m: [0.2, -1]\n", "size_m.1"),
             ("grasped: [north]\n", "Unknown corner 'north'"),
-            ("grasped: [99]\n", r"node 99 does not exist, the cloth has 0\.\.48"),
+            ("grasped: [99]\n", r"node 99 does not exist. The cloth has nodes 0 to 48"),
             ("held: [right_top]\n", "held twice"),
             ("grasped: []\n", "either `grasped` or `grippers`"),
             ("grippers: {a: {grasped: [right_top]}}\ngrasped: [left_top]\n", "either `grasped` or `grippers`"),

@@ -289,11 +289,11 @@ class TestHalfSpace:
         (lambda system: {"track": torch.zeros(4, 1, 3).double()}, "A track has shape"),
         (
             lambda system: {"state": replace(init(system, 1), positions=torch.zeros(1, 3, 3).double())},
-            r"positions has shape \[batch, \d+, 3\] here, got \[1, 3, 3\]",
+            r"positions must have shape \[batch, \d+, 3\], got \[1, 3, 3\]",
         ),
         (
             lambda system: {"properties": replace(system.properties, node_mass=torch.ones(1, 2).double())},
-            r"node_mass has shape \[batch, \d+\] here",
+            r"node_mass must have shape \[batch, \d+\]",
         ),
     ],
 )
