@@ -243,7 +243,7 @@ def test_a_pair_at_the_thickness_exactly_has_no_force():
 @pytest.mark.parametrize("smallest", [1e-6, 1e-4])
 def test_pairs_and_counts_are_those_of_the_slow_twin(rng, smallest):
     doubled = edges = mixed = 0
-    for _ in range(8):
+    for _ in range(12):
         surface, points = crumpled(rng)
         settings = repulsion(surface, points, smallest)
         corners, constants = pairs_at(surface, settings, points)

@@ -14,7 +14,7 @@ from diffcloud.cli.data import COMMANDS as DATA
 from diffcloud.cli.network import COMMANDS as NETWORK
 from diffcloud.regressors import MODEL_NAMES, PROFILE_NAMES
 from diffcloud.scene.scenarios import SCENARIO_NAMES
-from tests.docs.examples import ROOT
+from tests.cli.invoke import ROOT
 
 LEAVES = [[name] for name in COMMANDS if name not in ("data", "network")]
 LEAVES += [["data", name] for name in DATA] + [["network", name] for name in NETWORK]

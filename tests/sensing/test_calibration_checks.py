@@ -134,7 +134,8 @@ class TestSuspects:
         )
         assert done.result["forced"] is False
 
-    @pytest.mark.parametrize(("name", "factor"), [("overhead", 0.95), ("side", 1.06)])
+    @pytest.mark.parametrize("factor", [0.95, 1.06])
+    @pytest.mark.parametrize("name", ["overhead", "side"])
     def test_focal_length_of_one_camera(self, episode, tmp_path, name, factor):
         def change(data):
             data["intrinsics"]["fx"] *= factor
