@@ -34,7 +34,7 @@ _HANGING_UNCERTAIN = {
 }
 """The air's are wide: the sheet swings through it, and theory for a flat plate is a guess."""
 _HANGING_NODES, _MESH_NODES = 7, 300
-_STEPS = 16
+_STEPS = 8
 _GRIP_KNOWN = 1.5
 
 

@@ -13,7 +13,7 @@ import torch
 from diffcloud.errors import DivergedError
 from diffcloud.estimation.joint import JointObjective
 from diffcloud.estimation.likelihood import Answer, Estimate, LikelihoodSettings, energy
-from diffcloud.estimation.likelihood.energy import Likelihood
+from diffcloud.estimation.likelihood.energy import Likelihood, up_to_horizon
 from diffcloud.estimation.likelihood.frames import Frames
 from diffcloud.estimation.likelihood.grasp import in_powers, regripped, that_fits
 from diffcloud.estimation.likelihood.recording import Changes, Linear
@@ -115,7 +115,20 @@ class TestRecording:
         for apart, count in ((1.0, 12), (1e-9, 5)):
             monkeypatch.setattr(energy, "_GONE_M", apart)
             monkeypatch.setattr(energy, "_PART_M", apart)
-            assert member.horizons(member.start({}, 0.0)) == (count,)
+            assert member.horizons(member.start({}, 0.0)) == [count]
+
+    def test_early_frames_are_tried_first(self, monkeypatch):
+        """What the finer mesh changes in the frames that count is not simulated again."""
+        monkeypatch.setattr(energy, "_EARLY_S", 0.7)
+        for apart, count, simulations in ((1.0, 12, 4), (1e-9, 5, 2)):
+            monkeypatch.setattr(energy, "_GONE_M", apart)
+            monkeypatch.setattr(energy, "_PART_M", apart)
+            found = up_to_horizon([objective()], SPACE, LikelihoodSettings())
+            assert (found.frames, found.simulations) == (count, simulations)
+            (recording,), place = found.recordings, found.start({}, 0.0)
+            assert torch.equal(recording.refined[0], place)
+            again = recording.change(place, recording.nodes(place), recording.finer)
+            torch.testing.assert_close(recording.refined[1], again, rtol=0.0, atol=1e-12)
 
 
 class TestGrasp:

@@ -149,11 +149,16 @@ class Descent:
         self.of.looked = place
 
         def look(one: Linear, old: Changes) -> Changes:
-            finer = self._changed(one, place, one.recording.finer) if one.recording.model_error else None
+            finer = self._refined(one, place) if one.recording.model_error else None
             grips = [self._changed(one, place, other) for other in one.recording.regripped]
             return Changes(old.finer if finer is None else finer, in_powers(grips) or old.grip)
 
         self.of.changes = map_threads(lambda pair: look(*pair), [*zip(linear, self.of.changes, strict=True)])
+
+    def _refined(self, one: Linear, place: Tensor) -> Tensor | None:
+        """Return the node displacements by mesh refinement; None if the refined mesh diverges."""
+        known = one.recording.refined
+        return known[1] if known and torch.equal(known[0], place) else self._changed(one, place, one.recording.finer)
 
     def _changed(self, one: Linear, place: Tensor, variant: Scenario) -> Tensor | None:
         """Return the node displacements that a scenario variant causes; None if it diverges."""

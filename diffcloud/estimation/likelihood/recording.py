@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -53,6 +54,8 @@ class Recording:
         times = objective.times.sort().values
         gap = float(times.diff().median()) if len(times) > 1 else _FRAME_S
         self.independent = INDEPENDENT * min(1.0, gap / _FRAME_S)
+        self.refined: tuple[Tensor, Tensor] | None = None
+        """Coordinates [K], and the node displacements [1, L, C · V, 3] by mesh refinement there, if known."""
 
     def parameters(self, place: Tensor) -> dict[str, Tensor]:
         return self.space.parameters(self.axis.bounded(place[None, self.motion]))
@@ -65,6 +68,13 @@ class Recording:
     def finer(self) -> Scenario:
         """The scenario with the refined mesh."""
         return self.objective.scenario.finer()
+
+    def refined_in(self, frames: Sequence[int]) -> tuple[Tensor, Tensor] | None:
+        """Return `refined` for a subset of the frames."""
+        if self.refined is None:
+            return None
+        chosen = [self.objective.frames.index(frame) for frame in frames]
+        return self.refined[0], self.refined[1][:, chosen]
 
     def change(self, place: Tensor, nodes: Tensor, variant: Scenario) -> Tensor:
         """Return the node displacements [1, L, C · V, 3] that a scenario variant causes."""
