@@ -58,7 +58,7 @@ class NeighbourIndex:
         distance = self._beside[0]
         return 0.0 if distance.shape[1] < _FEWEST else float(np.median(distance[:, 1]))
 
-    @property
+    @cached_property
     def from_surface(self) -> tuple[float, float]:
         """Mean squared distances [m²] from the surface to the nearest point, and from a point to the surface. Surface
         positions are points projected to the plane of their neighbours, and a point is not its own neighbour. Zero if there

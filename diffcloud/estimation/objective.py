@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
+from copy import copy
 from dataclasses import replace
 
 import numpy as np
@@ -153,20 +154,17 @@ class Objective:
 
     def of(self, scenario: Scenario) -> Objective:
         """Return the objective of the same recording for another variant of its scenario."""
-        found = self._anew(scenario, self.frames)
-        found.asked_frames = self.asked_frames
-        return found
-
-    def _anew(self, scenario: Scenario, frames: Sequence[int]) -> Objective:
-        return Objective(
+        found = Objective(
             scenario,
             self.episode,
             paper=self.paper,
             nuisance=self.nuisance,
-            frames=frames,
+            frames=self.frames,
             points=self.asked_points,
             seed=self._seed,
         )
+        found.asked_frames = self.asked_frames
+        return found
 
     def reseed(self, seed: int) -> None:
         """Sample new points on the cloth and in the clouds."""
@@ -411,8 +409,12 @@ class Objective:
             counts: a single number of frames. A `JointObjective` takes one number per recording.
         """
         (count,) = counts
-        chosen = sorted(self.times.argsort(stable=True)[:count].tolist())
-        return self._anew(self.scenario, [self.frames[each] for each in chosen])
+        found, chosen = copy(self), sorted(self.times.argsort(stable=True)[:count].tolist())
+        found._target, found._first = self._target.at(chosen), None
+        found.asked_frames = found.frames
+        found.reseed(self._seed)
+        found.loss_steps = found._steps_to_loss()
+        return found
 
     def with_bodies(self, positions: Tensor) -> Tensor:
         """Append the nodes of the other bodies to cloth nodes [..., C · V', 3]; the loss of the paper has none."""
