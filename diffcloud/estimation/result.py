@@ -425,9 +425,14 @@ def _estimate(found: Estimate, members: Sequence[Objective]) -> EstimateRecord:
         weights=found.weights.tolist(),
         recordings=[
             Followed(
-                horizon_s=float(member.times.max()), chi_squares=chi_squares, finer_mm=[1e3 * apart for apart in apart_m]
+                horizon_s=float(member.times.max()),
+                departs=departs,
+                chi_squares=chi_squares,
+                finer_mm=[1e3 * apart for apart in apart_m],
             )
-            for member, chi_squares, apart_m in zip(members, found.best.chi_squares, found.best.apart_m, strict=True)
+            for member, departs, chi_squares, apart_m in zip(
+                members, found.departs, found.best.chi_squares, found.best.apart_m, strict=True
+            )
         ],
     )
 

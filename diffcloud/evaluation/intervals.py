@@ -21,6 +21,7 @@ from pydantic import ConfigDict, ValidationError
 from scipy.special import ndtri
 
 from diffcloud.errors import ConfigError
+from diffcloud.estimation.likelihood import FOLLOWS
 from diffcloud.estimation.parameters import FitSpace
 from diffcloud.estimation.record import FitRecord
 from diffcloud.estimation.residuals import Axis
@@ -41,8 +42,6 @@ ParameterStatus = Literal[
 ]
 _PLAIN = 1e6
 """Numbers below this are written without an exponent."""
-FOLLOWS = 4.0
-"""Maximum ratio of mean squared distance to expected variance for which the model fits a recording."""
 _ENDLESS = 700.0
 """Largest logarithm of a factor, to avoid overflow."""
 _UNFINISHED = "the descent took all its steps before it arrived: give it more with --max-steps"

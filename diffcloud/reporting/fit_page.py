@@ -13,10 +13,11 @@ import torch
 
 import diffcloud
 from diffcloud.estimation.joint import AnyObjective, JointObjective
+from diffcloud.estimation.likelihood import FOLLOWS
 from diffcloud.estimation.objective import Objective
 from diffcloud.estimation.record import FitRecord
 from diffcloud.estimation.result import FittedMotion
-from diffcloud.evaluation.intervals import FOLLOWS, Intervals, stated_parameters
+from diffcloud.evaluation.intervals import Intervals, stated_parameters
 from diffcloud.evaluation.methods import space_of
 from diffcloud.evaluation.summary import largest_sources
 from diffcloud.io.episodes import Episode
@@ -94,25 +95,28 @@ def _motion_of(objective: Objective) -> str:
     return str(np.round(end / max(float(np.abs(end).max()), 1e-9), 0).tolist())
 
 
-def _follows(record: FitRecord) -> list[str]:
+def followed_until(record: FitRecord) -> list[str]:
     """Return sentences that state until when the simulation follows each recording."""
     lines, followed, horizons = [], [], []
     for one, told in zip(record.episodes, record.estimate.recordings if record.estimate else (), strict=False):
         gone = np.flatnonzero(np.array(told.chi_squares) > FOLLOWS)
-        rate = told.horizon_s / max(one.frames[-1], 1)
-        if len(gone) == 0:
+        last = int(gone[0]) - 1 if len(gone) else len(told.chi_squares) - 1
+        if last < 0:
+            lines.append(f"The simulation does not follow {one.name} from the first frame on.")
+        elif len(gone) or told.departs:
+            until = told.horizon_s * one.frames[last] / max(one.frames[-1], 1)
+            lines.append(
+                f"The simulation follows {one.name} to within noise and mesh error until {until:.1f} s, and then departs "
+                "from it."
+            )
+        else:
             followed.append(one.name)
             horizons.append(told.horizon_s)
-        elif gone[0] == 0:
-            lines.append(f"The simulation does not follow {one.name} from the first frame on.")
-        else:
-            until = f"until {rate * one.frames[gone[0]]:.1f} s only"
-            lines.append(f"The simulation follows {one.name} to within noise and mesh error {until}.")
     if followed:
         names = " and ".join(followed) if len(followed) < 3 else f"{len(followed)} recordings"
         ends = sorted({f"{horizon:.1f}" for horizon in (min(horizons), max(horizons))})
-        until = f"up to the horizon, {' to '.join(ends)} s"
-        lines.insert(0, f"The simulation follows {names} to within noise and mesh error {until}.")
+        up_to = f"up to the horizon, {' to '.join(ends)} s"
+        lines.insert(0, f"The simulation follows {names} to within noise and mesh error {up_to}.")
     return lines
 
 
@@ -137,7 +141,7 @@ def summary_of(told: Told) -> Summary:
         status, good = f"Unfinished: {told.status.value}", False
         why = "Ctrl-C was pressed" if told.status == Status.interrupted else "the time of --budget was over"
         findings.insert(0, f"Unfinished: {why}. These are the best parameters so far.")
-    findings += _follows(record)
+    findings += followed_until(record)
     if record.estimate is not None and record.estimate.grip_m is not None:
         findings.append(f"The grasp is {1e3 * record.estimate.grip_m:.0f} mm wide, as the fit found it.")
     return Summary(

@@ -7,9 +7,11 @@ import json
 import os
 import subprocess
 import sys
+import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import typer
 from typer.main import get_command
@@ -25,6 +27,23 @@ _COMMANDS = {"simulate": "generate"}
 """Stage -> name of its function, where they differ."""
 DIFFCLOUD = [sys.executable, "-m", "diffcloud"]
 ROOT = Path(__file__).parents[2]
+T = TypeVar("T")
+
+
+def wait_for(seen: Callable[[], T], process: subprocess.Popen[Any]) -> T:
+    """Return the first true value of `seen`. A process may need minutes to start on a busy machine.
+
+    Raises:
+        AssertionError: the process ended before, or nothing was seen for five minutes.
+    """
+    deadline = time.monotonic() + 300
+    while True:
+        ended = process.poll()
+        if found := seen():
+            return found
+        assert ended is None, f"ended with {ended} before it was seen"
+        assert time.monotonic() < deadline, "nothing seen in five minutes"
+        time.sleep(0.005)
 
 
 def environment() -> dict[str, str]:

@@ -33,7 +33,7 @@ from diffcloud.jobs.scenarios import scene_named
 from diffcloud.scene.scenarios import load_scenario
 from diffcloud.sim.properties import one_set
 from tests.arcsim.files import MESHES, over_moving_box, write_file, write_files
-from tests.cli.invoke import DIFFCLOUD, ROOT, Invoked, environment, invoke, stage, study
+from tests.cli.invoke import DIFFCLOUD, ROOT, Invoked, environment, invoke, stage, study, wait_for
 from tests.conftest import small_lift
 from tests.estimation.test_fit import clouds_of
 
@@ -354,9 +354,7 @@ def test_ctrl_c_stops_fits_in_processes_and_keeps_their_best(tree):
     told(tree, solver={"name": "adam", "max_steps": 1_000_000, "threshold": 5e-5})
     command = [sys.executable, "-m", "pipeline.fit", *FIT[1:], "--workers", "2"]
     process = subprocess.Popen(command, cwd=tree, env=environment(), stderr=subprocess.PIPE, text=True)
-    deadline = time.monotonic() + 60
-    while not (tree / "fits" / "small" / "easy.json").exists() and time.monotonic() < deadline:
-        time.sleep(0.05)
+    wait_for((tree / "fits" / "small" / "easy.json").exists, process)
     time.sleep(3)  # the other process began when this one did
     process.send_signal(signal.SIGINT)
     _, said = process.communicate(timeout=60)
@@ -388,9 +386,7 @@ def test_a_scheduler_that_dies_loses_no_finished_fit(tree, tmp_path_factory):
     with subprocess.Popen([sys.executable, tree / "cluster.py"], cwd=elsewhere, env=environment(), **pipes) as cluster:
         command = [sys.executable, "-m", "pipeline.fit", *FIT[1:], "--scheduler", cluster.stdout.readline().strip()]
         process = subprocess.Popen(command, cwd=tree, env=environment(), stderr=subprocess.PIPE, text=True)
-        deadline = time.monotonic() + 60
-        while not (tree / "fits" / "small" / "e1.json").exists() and time.monotonic() < deadline:
-            time.sleep(0.02)
+        wait_for((tree / "fits" / "small" / "e1.json").exists, process)
         os.killpg(cluster.pid, signal.SIGKILL)
         _, said = process.communicate(timeout=120)
     assert process.returncode == 1, said

@@ -6,7 +6,6 @@ from __future__ import annotations
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +15,7 @@ import yaml
 
 from diffcloud.io.episodes import write_episode
 from diffcloud.io.simulated import write_simulated
-from tests.cli.invoke import environment, invoke, program, run_process
+from tests.cli.invoke import environment, invoke, program, run_process, wait_for
 from tests.cli.test_commands import SMALL
 from tests.conftest import small_lift
 from tests.estimation.test_fit import clouds_of
@@ -180,10 +179,8 @@ class TestTwoAtOnce:
         (work / "out").rename(work / "whole")
         env = environment()
         with subprocess.Popen(program(*command), cwd=work, env=env, stderr=subprocess.PIPE, text=True) as first:
-            deadline = time.monotonic() + 60
             lock = work / ".out.diffcloud-lock"
-            while not (lock.exists() and lock.stat().st_size) and time.monotonic() < deadline:
-                time.sleep(0.005)
+            wait_for(lambda: lock.exists() and lock.stat().st_size, first)
             # held still, so that the second comes in the middle however slow the machine is
             first.send_signal(signal.SIGSTOP)
             done = invoke(*command, code=1)
@@ -204,10 +201,7 @@ class TestLostWorkers:
         env = environment()
         command = program(*SET, "--workers", "2", "--out", "killed")
         process = subprocess.Popen(command, cwd=work, env=env, stderr=subprocess.PIPE, text=True, start_new_session=True)
-        deadline = time.monotonic() + 60
-        while not (workers := _workers_of(process.pid)) and time.monotonic() < deadline:
-            time.sleep(0.01)
-        for worker in workers:
+        for worker in wait_for(lambda: _workers_of(process.pid), process):
             worker.kill()
         _, said = process.communicate(timeout=120)
         assert "Traceback" not in said

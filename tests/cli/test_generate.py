@@ -7,7 +7,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +20,7 @@ from diffcloud.errors import DiffCloudError
 from diffcloud.io.simulated import SimulatedSet
 from diffcloud.jobs import cluster
 from diffcloud.regressors.dataset import Augmentation, CloudDataset
-from tests.cli.invoke import DIFFCLOUD, ROOT, environment, run_process
+from tests.cli.invoke import DIFFCLOUD, ROOT, environment, run_process, wait_for
 from tests.cli.test_commands import SMALL
 from tests.datasets.test_simulation import contents
 
@@ -54,9 +53,7 @@ def interrupted(work: Path, out: str, how: signal.Signals) -> tuple[int, str]:
     env = environment()
     command = [*DIFFCLOUD, *map(str, SET), "--workers", "0", "--out", out]
     process = subprocess.Popen(command, cwd=work, env=env, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True)
-    deadline = time.monotonic() + 60
-    while not (work / f"{out}.partial" / "train-000000.npz").exists() and time.monotonic() < deadline:
-        time.sleep(0.005)
+    wait_for((work / f"{out}.partial" / "train-000000.npz").exists, process)
     process.send_signal(how)
     _, said = process.communicate(timeout=60)
     assert not (work / out).exists()

@@ -44,11 +44,13 @@ def member():
     return Likelihood([objective()], SPACE, LikelihoodSettings())
 
 
+FINE = small_lift(**{**GENTLE, "integrator": "implicit", "points": 2000, "nodes": (9, 9)})
+"""On a mesh whose faces are small enough to lie on the finer cloth. Larger faces cut its curves short."""
+
+
 @pytest.fixture(scope="module")
 def found():
-    """On a mesh whose faces are small enough to lie on the finer cloth: larger ones cut its curves short."""
-    fine = small_lift(**{**GENTLE, "integrator": "implicit", "points": 2000, "nodes": (9, 9)})
-    return fit_likelihood(objective(fine), SPACE, LikelihoodSettings())
+    return fit_likelihood(objective(FINE), SPACE, LikelihoodSettings())
 
 
 def frames(squares, variances, variables=1):
@@ -131,6 +133,32 @@ class TestRecording:
             torch.testing.assert_close(recording.refined[1], again, rtol=0.0, atol=1e-12)
 
 
+class TestDeparture:
+    def test_the_frames_after_it_do_not_move_the_result(self):
+        """In the last three frames, the recorded cloth is 2 cm higher. Without them, the result is the same."""
+        whole = clouds_of(FINE.finer(), points=2000, **TRUTH)
+        points = whole.points.copy()
+        points[whole.offsets[-4] :, 2] += 0.02
+        departed = Objective(FINE, replace(whole, points=points), nuisance=POSE)
+        told = fit_likelihood(departed, SPACE, LikelihoodSettings()).estimate
+        assert told.departs == (True,)
+        before = departed.frames[:-3]
+        assert told.members[0].frames == before
+        assert len(told.best.chi_squares[0]) == len(before)
+        assert max(told.best.chi_squares[0]) < energy.FOLLOWS
+        alone = fit_likelihood(departed.earliest([len(before)]), SPACE, LikelihoodSettings()).estimate
+        assert alone.departs == (False,)
+        assert abs(float(told.mean[0] - alone.mean[0])) < 0.3 * float(alone.covariance[0, 0].sqrt())
+
+    def test_later_frames_are_left_out(self, member):
+        squares = [0.5] * 12
+        assert member.before_departure([squares]) is None
+        for first, count in ((8, 8), (2, 5)):
+            shorter = member.before_departure([squares[:first] + [2.1] + squares[first + 1 :]])
+            assert shorter.frames == count
+        assert member.earliest([5]).before_departure([[9.0] * 5]) is None
+
+
 class TestGrasp:
     def scenario(self, size, within=1.5):
         options = {"nodes": (7, 7), "size_m": (0.3, 0.3), "frames": 10, "steps_per_frame": 8, "air": "none"}
@@ -205,14 +233,14 @@ class TestMixture:
         )  # fmt: skip
 
     def test_equally_likely_answers(self):
-        found = Estimate(FitSpace((SPACE.variables[0],), {}), self.answers(3.0, 3.0), (), None, 2)
+        found = Estimate(FitSpace((SPACE.variables[0],), {}), self.answers(3.0, 3.0), (), (), None, 2)
         assert found.weights.tolist() == [0.5, 0.5]
         assert float(found.mean) == 0.5
         assert float(found.covariance) == pytest.approx(0.5 + 0.25)
         assert float(found.sources["starts"]) == pytest.approx(0.25)
 
     def test_an_unlikely_one_hardly_counts(self):
-        found = Estimate(FitSpace((SPACE.variables[0],), {}), self.answers(0.0, 40.0), (), None, 2)
+        found = Estimate(FitSpace((SPACE.variables[0],), {}), self.answers(0.0, 40.0), (), (), None, 2)
         assert float(found.mean) < 1e-8
         assert float(found.covariance) == pytest.approx(0.5, abs=1e-7)
 

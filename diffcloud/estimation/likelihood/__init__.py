@@ -17,13 +17,17 @@ its displacement is added to the simulated nodes. Half of this displacement is t
 that this simulator made on the same mesh need no correction. For them the horizon only limits the descents, and the
 best result is refined on all frames if possible.
 
+A model may also depart from the recording earlier, for example because its contact is wrong. If c of the best result
+exceeds 2 in a frame, the descents continue without that frame and the later ones.
+
 The variables are those of the space, the pose of each recording, and the size of the grasp if it is unknown. The effect
 of the grasp size is interpolated between three sizes, which are centred on the result of the first start. Gauss–Newton
 steps with a bound in each variable are taken from three starts. The results are weighted by their likelihoods.
 """
 
 from diffcloud.estimation.likelihood.descent import Answer
+from diffcloud.estimation.likelihood.energy import FOLLOWS
 from diffcloud.estimation.likelihood.estimate import Estimate, estimate
 from diffcloud.estimation.likelihood.settings import LikelihoodSettings
 
-__all__ = ["Answer", "Estimate", "LikelihoodSettings", "estimate"]
+__all__ = ["FOLLOWS", "Answer", "Estimate", "LikelihoodSettings", "estimate"]

@@ -93,7 +93,7 @@ class Descent:
         """
         of, place, radius, tried = self.of, self.place, _RADIUS, 0
         allowed = _RISE * sum(one.independent * len(one.objective.frames) for one in of.recordings)
-        for _ in range(of.iterations):
+        for _ in range(of.settings.max_steps):
             best = self.reached
             try:
                 linear = self._linear(place)

@@ -19,6 +19,8 @@ from diffcloud.estimation.parameters import FitSpace
 from diffcloud.estimation.residuals import Axis
 from diffcloud.sim.threads import map_threads
 
+FOLLOWS = 2.0
+"""The motion departs from a recording in the first frame with a larger c."""
 _PART_M, _GONE_M = 0.004, 0.010
 """RMS displacement by mesh refinement [m] at the horizon, after `_LEAST_S` and before."""
 _LEAST_S = 1.2
@@ -48,7 +50,7 @@ class Likelihood:
         Args:
             grip: grasp size of the scenarios, in standard deviations from the stated size.
         """
-        self.space, self.axis, self.iterations = space, Axis.of(space), settings.max_steps
+        self.space, self.axis, self.settings = space, Axis.of(space), settings
         self.recordings, self.simulations, self.grip = list[Recording](), 0, grip
         variables = count = len(space.names)
         last = variables + sum(len(one.pose_space.names) for one in objectives)
@@ -85,17 +87,34 @@ class Likelihood:
         return torch.where(self.precision > 0, place - self.centre, 0.0)
 
     def horizons(self, place: Tensor) -> list[int]:
-        """Return for each recording the number of frames before the refined and the given mesh diverge."""
+        """Return for each recording the number of frames before the refined mesh moves away from the given one."""
 
         def one(recording: Recording) -> int:
             recording.refined = place, recording.change(place, recording.nodes(place), recording.finer)
             apart = squared(recording.refined[1]).sqrt() * recording.objective.length_unit_m
-            times, order = recording.objective.times.sort(stable=True)
-            gone = torch.nonzero(apart[order] > torch.where(times > _LEAST_S, _PART_M, _GONE_M))
-            return min(max(int(gone[0]), _FEWEST), len(apart)) if len(gone) else len(apart)
+            times = recording.objective.times
+            return _before(apart > torch.where(times > _LEAST_S, _PART_M, _GONE_M), times)
 
         self.simulations += 2 * len(self.recordings)
         return map_threads(one, self.recordings)
+
+    def before_departure(self, chi_squares: Sequence[Sequence[float]]) -> Likelihood | None:
+        """Return the likelihood of the frames before the motion departs from a recording; None if it does not.
+
+        Args:
+            chi_squares: for each recording, c of its frames.
+        """
+        found = zip(self.recordings, chi_squares, strict=True)
+        counts = [_before(torch.tensor(squares) > FOLLOWS, one.objective.times) for one, squares in found]
+        return self.earliest(counts) if sum(counts) < self.frames else None
+
+    def earliest(self, counts: Sequence[int]) -> Likelihood:
+        """Return the likelihood of the earliest frames, with this number of frames of each recording."""
+        members = [one.objective.earliest([count]) for one, count in zip(self.recordings, counts, strict=True)]
+        found = Likelihood(members, self.space, self.settings, self.grip)
+        for one, whole in zip(found.recordings, self.recordings, strict=True):
+            one.refined = whole.refined_in(one.objective.frames)
+        return found
 
     def start(self, init: Mapping[str, float], offset: float) -> Tensor:
         """Return start coordinates [K] from these values, or else from the centres of the priors.
@@ -156,12 +175,15 @@ def up_to_horizon(
         found = zip(horizons, tested.recordings, members, strict=True)
         if not any(count == len(part.objective.times) < len(whole.times) for count, part, whole in found):
             break
-    early = [one.objective.earliest([count]) for one, count in zip(tested.recordings, horizons, strict=True)]
-    likelihood = Likelihood(early, space, settings, grip)
-    for one, before in zip(likelihood.recordings, tested.recordings, strict=True):
-        one.refined = before.refined_in(one.objective.frames)
+    likelihood = tested.earliest(horizons)
     likelihood.simulations = simulations
     return likelihood
+
+
+def _before(gone: Tensor, times: Tensor) -> int:
+    """Return the number of frames earlier than the first marked one, but at least `_FEWEST`."""
+    places = torch.nonzero(gone[times.argsort(stable=True)])
+    return min(max(int(places[0]), _FEWEST), len(gone)) if len(places) else len(gone)
 
 
 def _until(objective: Objective, last: float) -> Objective:

@@ -36,6 +36,8 @@ class Estimate:
     """Results of all completed starts, the most likely first."""
     members: tuple[Objective, ...]
     """Objectives up to their horizons, with the estimated grasp size."""
+    departs: tuple[bool, ...]
+    """For each recording, whether frames before the horizon are left out because the motion departs from it."""
     grip: float | None
     """Estimated grasp size, in standard deviations from the stated size; None if the size is known."""
     simulations: int
@@ -120,7 +122,7 @@ def estimate(
             failures.append(error)
             return None
 
-    interrupted = False
+    interrupted, departs = False, [False] * len(objective.members)
     try:
         for number in range(settings.starts):
             away = _START * ((number + 1) // 2) * (1 if number % 2 else -1)
@@ -136,6 +138,19 @@ def estimate(
                 found = follow(number, place, likelihood)
             if found is not None:
                 answers.append(found)
+        horizon = likelihood.recordings
+        while settings.model_error and answers:
+            best = min(answers, key=lambda one: one.energy)
+            shorter = likelihood.before_departure(best.chi_squares)
+            if shorter is None:
+                break
+            simulated.append(shorter)
+            again = [follow(settings.starts, one.place, shorter) for one in answers]
+            if not any(again):
+                break
+            likelihood, answers = shorter, [one for one in again if one is not None]
+            pairs = zip(shorter.recordings, horizon, strict=True)
+            departs = [len(one.objective.frames) < len(whole.objective.frames) for one, whole in pairs]
         every = sum(len(one.frames) for one in objective.members)
         if answers and not settings.model_error and likelihood.frames < every:
             best = min(answers, key=lambda one: one.energy)
@@ -162,4 +177,4 @@ def estimate(
         found_so = [known(one) for one in gripped(objective.members, grip)]
         members = [one.earliest([count]) for one, count in zip(found_so, counts, strict=True)]
     simulations = sum(one.simulations for one in simulated)
-    return Estimate(space, tuple(answers), tuple(members), grip, simulations, interrupted)
+    return Estimate(space, tuple(answers), tuple(members), tuple(departs), grip, simulations, interrupted)
