@@ -12,7 +12,7 @@ is twice the negative log-posterior, for n independent residuals per frame. Mode
 so n is much smaller than the number of points.
 
 After some time the folding of a cloth is unpredictable, and derivatives explode. Frames are therefore used only up to a
-horizon, at which the refined and the given mesh diverge from each other. The refined mesh also corrects the positions:
+horizon, at which the refined mesh moves differently from the given one. The refined mesh also corrects the positions:
 its displacement is added to the simulated nodes. Half of this displacement is treated as an uncertainty. Recordings
 that this simulator made on the same mesh need no correction. For them the horizon only limits the descents, and the
 best result is refined on all frames if possible.

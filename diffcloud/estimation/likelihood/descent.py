@@ -156,12 +156,12 @@ class Descent:
         self.of.changes = map_threads(lambda pair: look(*pair), [*zip(linear, self.of.changes, strict=True)])
 
     def _refined(self, one: Linear, place: Tensor) -> Tensor | None:
-        """Return the node displacements by mesh refinement; None if the refined mesh diverges."""
+        """Return the node displacements by mesh refinement; None if the simulation of the refined mesh diverges."""
         known = one.recording.refined
         return known[1] if known and torch.equal(known[0], place) else self._changed(one, place, one.recording.finer)
 
     def _changed(self, one: Linear, place: Tensor, variant: Scenario) -> Tensor | None:
-        """Return the node displacements that a scenario variant causes; None if it diverges."""
+        """Return the node displacements that a scenario variant causes; None if its simulation diverges."""
         self.of.simulations += 1
         try:
             return one.recording.change(place, one.nodes, variant)

@@ -55,7 +55,8 @@ class Recording:
         gap = float(times.diff().median()) if len(times) > 1 else _FRAME_S
         self.independent = INDEPENDENT * min(1.0, gap / _FRAME_S)
         self.refined: tuple[Tensor, Tensor] | None = None
-        """Coordinates [K], and the node displacements [1, L, C · V, 3] by mesh refinement there, if known."""
+        """Coordinates [K] and, in the scene's unit, the node displacements [1, L, C · V, 3] that mesh refinement causes
+        at them. None before the refined mesh was simulated."""
 
     def parameters(self, place: Tensor) -> dict[str, Tensor]:
         return self.space.parameters(self.axis.bounded(place[None, self.motion]))
