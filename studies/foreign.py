@@ -48,14 +48,14 @@ from diffcloud.scene.scenarios.grid import GridScenario
 from diffcloud.sensing.cameras import looking_at
 from diffcloud.sensing.recorder import caster
 from diffcloud.sim.motion import Keyframe, Motion
-from diffcloud.simulators import mujoco, newton
+from diffcloud.simulators import mujoco, newton, ours
 from diffcloud.simulators.problem import REST_HEIGHT, Problem, Sheet, installed
 from diffcloud.simulators.problems import strip
 from studies.mujoco_towels import COUNTS, one_way
 
 Floats = NDArray[np.float64]
 Kind = Literal["lift", "fold", "pair", "shirt", "skirt", "vest"]
-Simulator = Literal["mujoco", "newton"]
+Simulator = Literal["mujoco", "newton", "diffcloud"]
 
 COLUMNS, ROWS = COUNTS
 """Nodes of the foreign cloth."""
@@ -121,6 +121,7 @@ SETS = (
     Set("vests", "vests of one layer, lifted by a strap; mesh, pad and track told", kind="vest", most=3),
     Set("skirts", "skirts of one layer, lifted at the waist; mesh, pad and track told", kind="skirt", most=3),
     Set("pairs", "held at two corners by two grippers; size, pad and tracks told", kind="pair", most=6),
+    Set("finer", "the same lifts, moved by this simulator on 49 × 37 nodes", simulator="diffcloud", most=40),
     Set("joint", "two lifts of each towel, fitted together", motions=(0, 1), most=10),
 )
 
@@ -304,6 +305,8 @@ def moved(cloth: Cloth, simulator: Simulator, cache: Path) -> Moved:
     """The motion of a cloth, simulated once and kept."""
     path = cache / f"{simulator}-{cloth.kind}-{cloth.seed}-{cloth.motion}.npz"
     problem = _problem(cloth)
+    if simulator == "diffcloud":
+        problem = _finer(problem)
     if path.is_file():
         with np.load(path) as kept:
             nodes = kept["nodes"].astype(np.float64)
@@ -311,6 +314,8 @@ def moved(cloth: Cloth, simulator: Simulator, cache: Path) -> Moved:
         if simulator == "mujoco":
             settings, sheet = mujoco.stable(problem)
             nodes = mujoco.simulate(replace(problem, sheet=sheet), settings).nodes
+        elif simulator == "diffcloud":
+            nodes = ours.simulate(problem).nodes
         else:
             nodes = newton.simulate(problem, newton.Settings(step=_NEWTON_STEP)).nodes
         nodes = nodes.astype(np.float32)
@@ -372,6 +377,14 @@ def _problem(cloth: Cloth) -> Problem:
         self_contact=cloth.kind == "fold",
         rate=_RATE,
     )
+
+
+def _finer(problem: Problem) -> Problem:
+    """The problem on a mesh of half the edge length. Grippers hold the same part of the cloth."""
+    mesh, edges = refined(problem.mesh)
+    first, held = len(problem.mesh.nodes), problem.held
+    between = {first + index: held[a] for index, (a, b) in enumerate(edges.tolist()) if a in held and b in held}
+    return replace(problem, mesh=mesh, held={**held, **between})
 
 
 def seen(motion: Moved, cloth: Cloth, cameras: int, *, cut: bool) -> Episode:
