@@ -11,7 +11,17 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.table import Table
 
-from diffcloud.cli.options import ADVANCED, JsonFlag, ParamsFile, SceneName, Threads, Topics, merged, settings_options
+from diffcloud.cli.options import (
+    ADVANCED,
+    JsonFlag,
+    ParamsFile,
+    SceneName,
+    Threads,
+    Topics,
+    merged,
+    settings_options,
+    typed_options,
+)
 from diffcloud.console import duration_s, finish, show_panel
 from diffcloud.errors import ConfigError
 from diffcloud.estimation.settings import AdamSolver, FitSettings
@@ -23,6 +33,8 @@ if TYPE_CHECKING:
 
 _FITTING = 0.9
 """Part of the time of --budget after which fits end: the report needs some, too."""
+_NOT_OF_PROJECT = ("recordings", "out", "size", "mesh", "topic", "separate", "dvc", "params", "json")
+"""Parameters that do not belong to the command of a DVC project. What they found is in the folder."""
 
 
 @settings_options(
@@ -51,6 +63,7 @@ def fit(
     ],
     out: Annotated[Path, typer.Option(help="Folder for fit.json, intervals.json, report.html and the scene.")],
     settings: Mapping[str, Any],
+    context: typer.Context,
     size: Annotated[str | None, typer.Option(help="Sides in m, such as 0.40x0.30. Default: from the first frame.")] = None,
     mesh: Annotated[Path | None, typer.Option(help="OBJ file of a cloth that is no rectangle, in metres.")] = None,
     density: Annotated[
@@ -116,7 +129,7 @@ def fit(
                 interrupted = True
                 break
             if dvc:
-                make_project(folder)
+                make_project(folder, typed_options(context, _NOT_OF_PROJECT), params)
     finish(results if separate else next(iter(results.values())), json)
     if interrupted:
         raise KeyboardInterrupt

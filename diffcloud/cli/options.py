@@ -107,6 +107,22 @@ def settings_options(
     return decorate
 
 
+def typed_options(context: typer.Context, but: Sequence[str]) -> list[str]:
+    """The words of the options that were typed, without the parameters of these names."""
+    words = []
+    for option in context.command.params:
+        name = option.name or ""
+        source = context.get_parameter_source(name)
+        if name in but or source is None or source.name != "COMMANDLINE":
+            continue
+        value, flag = context.params[name], option.opts[0]
+        if value is True:
+            words.append(flag)
+        else:
+            words += [word for one in (value if isinstance(value, list | tuple) else [value]) for word in (flag, str(one))]
+    return words
+
+
 def merged(settings: Section, typed: Mapping[str, Any]) -> Any:
     """The settings with what was typed in place, field by field: a mapping or a block keeps what was not typed.
 

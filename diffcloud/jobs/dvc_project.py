@@ -2,25 +2,24 @@
 
 from __future__ import annotations
 
+import json
+import os
 import shlex
 import subprocess
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 from diffcloud.console import errors
 from diffcloud.errors import ConfigError
-from diffcloud.estimation.likelihood.settings import LikelihoodSettings
-from diffcloud.estimation.record import FitRecord, read_fit
-from diffcloud.estimation.settings import LEVEL
-from diffcloud.evaluation.intervals import read_intervals
-from diffcloud.evaluation.methods import space_of
+from diffcloud.estimation.record import read_fit
 from diffcloud.io.files import files_in, together, write_text
 from diffcloud.io.timings import NAME
 
 _PARAMS = """\
 # Settings for the stages of dvc.yaml. A stage runs again when its section or a file that it reads has changed.
 fit:
-  options: {options}  # all of `diffcloud fit --help` but --out
+  options: {options}  # see `diffcloud fit --help`
 export:
   to: mujoco  # newton, isaac, arcsim or obj
 """
@@ -29,9 +28,9 @@ _DVC = """\
 # A new recording of the cloth is one more file in episodes/.
 stages:
   fit:
-    cmd: diffcloud fit ${fit.options} --out . episodes/*.npz
+    cmd: diffcloud fit ${{fit.options}} --out . episodes/*.npz
     params: [fit]
-    deps: [episodes, cloth.yaml, recordings.yaml]
+    deps: [episodes, cloth.yaml, recordings.yaml{more}]
     metrics:
       - intervals.json:
           cache: false
@@ -47,21 +46,29 @@ stages:
           persist: true  # finished fits; the command checks which still belong to these recordings
 
   export:
-    cmd: diffcloud export fit.json --to ${export.to} --out exported
+    cmd: diffcloud export fit.json --to ${{export.to}} --out exported
     params: [export]
     deps: [fit.json, fit.npz, scenes]
     outs: [exported]
 """
 
 
-def make_project(folder: Path) -> None:
+def make_project(folder: Path, options: Sequence[str], params: Path | None = None) -> None:
     """Write dvc.yaml and params.yaml beside the files of a fit, which remain unchanged.
+
+    Args:
+        options: options of `diffcloud fit`.
+        params: file of `--params`.
 
     Raises:
         ConfigError: the folder already is a project, its fit is not finished, or DVC fails.
     """
-    record = _identified(folder)
-    pages = {"params.yaml": _PARAMS.format(options=_options(folder, record)), "dvc.yaml": _DVC}
+    _check_finished(folder)
+    words, more = list(options), ""
+    if params is not None:
+        file = os.path.relpath(params, folder)
+        words, more = [*words, "--params", file], f", {json.dumps(file)}"
+    pages = {"params.yaml": _PARAMS.format(options=json.dumps(shlex.join(words))), "dvc.yaml": _DVC.format(more=more)}
     for name, text in pages.items():
         path = folder / name
         if path.exists() and path.read_text(encoding="utf-8") != text:
@@ -98,8 +105,8 @@ def _start_dvc(folder: Path) -> None:
         raise ConfigError(f"`dvc init` failed in {folder}: {' '.join((done.stderr or done.stdout).split())[-300:]}")
 
 
-def _identified(folder: Path) -> FitRecord:
-    """Read the finished fit in a folder.
+def _check_finished(folder: Path) -> None:
+    """Check that a folder has a finished fit and its recordings.
 
     Raises:
         ConfigError: the fit is not finished, or a recording is missing.
@@ -116,19 +123,3 @@ def _identified(folder: Path) -> FitRecord:
         raise ConfigError(
             f"{folder / 'episodes'} lacks {', '.join(gone)}, recordings of the fit; run `diffcloud fit` again."
         )
-    return record
-
-
-def _options(folder: Path, record: FitRecord) -> str:
-    """Return the options for `diffcloud fit` that reproduce the fit."""
-    options = ["--parameters", ",".join(record.fitted)]
-    if (weighed := record.parameters.get("density")) is not None and weighed.fixed:
-        options += ["--density", f"{weighed.value:.12g}"]
-    told = read_intervals(folder / "intervals.json", space_of(record).asked)
-    if told.level != LEVEL:
-        options += ["--level", f"{told.level:g}"]
-    usual = LikelihoodSettings()
-    for name, value in (("starts", usual.starts), ("max_steps", usual.max_steps)):
-        if record.settings.get(name, value) != value:
-            options += [f"--{name.replace('_', '-')}", str(record.settings[name])]
-    return shlex.join(options)

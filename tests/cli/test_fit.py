@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import shlex
 import shutil
 import signal
 import subprocess
@@ -556,7 +557,7 @@ def project(found, tmp_path):
     shutil.copytree(found[0] / "found", tmp_path / "found")
     for page in ("params.yaml", "dvc.yaml"):
         (tmp_path / "found" / page).unlink(missing_ok=True)
-    make_project(tmp_path / "found")
+    make_project(tmp_path / "found", ["--parameters", "stretching", "--density", "0.25"])
     return tmp_path / "found"
 
 
@@ -589,16 +590,20 @@ class TestProject:
         assert [one.name for one in read_fit(project / "fit.json").episodes] == ["first"]
         assert "up to date" in dvc(project, "status", "fit")
 
-    def test_options_of_the_fit_are_kept(self, project):
-        fit = project / "fit.json"
-        stated = json.loads(fit.read_text())
-        stated["settings"] |= {"starts": 1, "max_steps": 7}
-        fit.write_text(json.dumps(stated))
+    def test_what_was_typed_is_kept(self, project):
+        """But the recordings and what was found in them. A path is relative to the project."""
+        (project.parent / "my settings.yaml").write_text("fit: {seed: 3}\n")
         for page in ("params.yaml", "dvc.yaml"):
             (project / page).unlink()
-        make_project(project)
+        typed = ("--parameters", "stretching", "--starts", "1", "--max-steps", "1", "--bound", "stretching=1:100")
+        typed += ("--init", "stretching=9", "--alignment", "x=1cm", "--budget", "none")
+        given = ("--params", "my settings.yaml", "--size", "0.16x0.12", "--density", "0.25", "--dvc", "--out", "found")
+        with contextlib.chdir(project.parent):
+            invoke("fit", "found/episodes/first.npz", *typed, *given)
         options = yaml.safe_load((project / "params.yaml").read_text())["fit"]["options"]
-        assert options == "--parameters stretching --density 0.25 --starts 1 --max-steps 7"
+        assert sorted(shlex.split(options)) == sorted([*typed, "--params", "../my settings.yaml", "--density", "0.25"])
+        stages = yaml.safe_load((project / "dvc.yaml").read_text())["stages"]
+        assert stages["fit"]["deps"] == ["episodes", "cloth.yaml", "recordings.yaml", "../my settings.yaml"]
 
     def test_its_stages_are_commands_that_exist(self, project):
         check_commands(yaml.safe_load((project / "dvc.yaml").read_text())["stages"])
@@ -610,38 +615,32 @@ class TestProject:
         shutil.copytree(project, inner, ignore=shutil.ignore_patterns(".dvc*", "*.yaml", "inner"))
         for name in ("cloth.yaml", "recordings.yaml"):
             shutil.copy(project / name, inner / name)
-        make_project(inner)
+        make_project(inner, [])
         assert not (inner / ".dvc").exists()  # the outer project's
 
     def test_nothing_is_written_over(self, project):
-        make_project(project)  # the same once more is no change
+        options = ["--parameters", "stretching", "--density", "0.25"]
+        make_project(project, options)  # the same once more is no change
         (project / "params.yaml").write_text("mine: 1\n")
         with pytest.raises(ConfigError, match=r"params\.yaml is there already"):
-            make_project(project)
+            make_project(project, options)
         assert (project / "params.yaml").read_text() == "mine: 1\n"
 
     def test_a_folder_where_no_fit_has_finished_is_refused(self, project, tmp_path):
         with pytest.raises(ConfigError, match=r"lacks cloth\.yaml, recordings\.yaml, fit\.json"):
-            make_project(tmp_path)
+            make_project(tmp_path, [])
         for name in ("params.yaml", "dvc.yaml", "episodes/first.npz"):
             (project / name).unlink()
         with pytest.raises(ConfigError, match="lacks first"):
-            make_project(project)
+            make_project(project, [])
         assert not (project / "dvc.yaml").exists()
 
-    @pytest.mark.parametrize(
-        ("name", "text", "told"),
-        [
-            ("intervals.json", "[]", "holds no intervals"),
-            ("fit.json", "{}", "fit.json"),
-        ],
-    )
-    def test_damaged_files_are_named_and_nothing_is_written(self, project, name, text, told):
+    def test_a_damaged_fit_is_named_and_nothing_is_written(self, project):
         for page in ("params.yaml", "dvc.yaml"):
             (project / page).unlink()
-        (project / name).write_text(text)
-        with pytest.raises(ConfigError, match=told):
-            make_project(project)
+        (project / "fit.json").write_text("{}")
+        with pytest.raises(ConfigError, match=r"fit\.json"):
+            make_project(project, [])
         assert not (project / "dvc.yaml").exists()
 
 
