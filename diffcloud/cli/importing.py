@@ -50,8 +50,20 @@ def import_(
     camera: Annotated[
         list[str] | None,
         typer.Option(
-            help="Clouds, also of ROS: NAME=X,Y,Z in metres, in the frame of the clouds, for every camera. Fits omit "
-            "parts that no camera could see."
+            help="Clouds, also of ROS: NAME=X,Y,Z in metres, in the robot's frame, for every camera. Fits omit parts that "
+            "no camera could see."
+        ),
+    ] = None,
+    transform: Annotated[
+        Path | None,
+        typer.Option(help="Clouds: text file of the 4 x 4 matrix from the frame of the clouds to the robot's frame."),
+    ] = None,
+    crop: Annotated[
+        str | None,
+        typer.Option(
+            metavar="X,Y,Z:X,Y,Z",
+            help="Clouds, also of ROS: opposite corners of a box in the robot's frame, in metres. Points outside are "
+            "removed.",
         ),
     ] = None,
     label: Annotated[
@@ -101,6 +113,7 @@ def import_(
     from diffcloud.hardware.realsense import play_recordings
     from diffcloud.io.labels import read_labels
     from diffcloud.jobs.imports import (
+        crop_box,
         import_clouds,
         import_recording,
         import_release,
@@ -114,19 +127,20 @@ def import_(
 
     found = source_kind(source, kind, topic or ())
     given = {
-        "--gripper": gripper, "--rate-hz": rate_hz, "--camera": camera, "--label": label, "--joint-log": joint_log,
+        "--gripper": gripper, "--rate-hz": rate_hz, "--camera": camera, "--transform": transform,
+        "--crop": crop, "--label": label, "--joint-log": joint_log,
         "--clock-offset": clock_offset, "--world-frame": world_frame, "--tool-frame": tool_frame, "--joints": joints,
         "--gripper-joint": gripper_joint, "--topic": topic, "--urdf": urdf, "--trajectories": trajectories,
     }  # fmt: skip
     refuse_others(source, found, [option for option, value in given.items() if value not in (None, [])])
-    labels = read_labels(label or [])
+    labels, box = read_labels(label or []), crop_box(crop)
     if found == "release":
         result = import_release(source[0], out, trajectories)
     elif found == "clouds":
-        result = import_clouds(source[0], out, gripper, rate_hz, labels, viewpoints(camera))
+        result = import_clouds(source[0], out, gripper, rate_hz, labels, viewpoints(camera), transform, box)
     elif found == "ros_clouds":
         choices = ros_choices(world_frame, tool_frame, joints, None, topic, urdf)
-        result = import_ros_clouds(list(named(source).values()), out, choices, labels, viewpoints(camera))
+        result = import_ros_clouds(list(named(source).values()), out, choices, labels, viewpoints(camera), box)
     else:
         if clock_offset is not None and joint_log is None:
             raise ConfigError("--clock-offset shifts the times of a joint log, and none is given. Give --joint-log too.")

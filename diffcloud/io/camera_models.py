@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import Annotated, Any, Literal, Self, get_args
 
 import numpy as np
@@ -10,7 +11,12 @@ from numpy.typing import NDArray
 from pydantic import AfterValidator, Field, model_validator
 
 from diffcloud.errors import EpisodeError, unknown_name
+from diffcloud.io.inputs import open_input
+from diffcloud.io.numbers import number
 from diffcloud.io.schema import Checked, Component
+
+_LARGEST_TRANSFORM = 10_000
+"""Size [bytes] of the largest text file of a transform."""
 
 Pixels = Annotated[int, Field(ge=1, le=20_000)]
 
@@ -134,14 +140,29 @@ def _rigid(rows: list[list[float]]) -> list[list[float]]:
     matrix = square(rows, 4)
     rotation = matrix[:3, :3]
     off = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
-    if off > 1e-4 or np.linalg.det(rotation) < 0 or np.abs(matrix[3] - [0, 0, 0, 1]).max() > 1e-9:
+    if not off <= 1e-4 or np.linalg.det(rotation) < 0 or np.abs(matrix[3] - [0, 0, 0, 1]).max() > 1e-9:
         raise ValueError(
             f"it is not a rigid transform (R Rᵀ differs from the identity by up to {off:.2g}); give [R t; 0 0 0 1] "
             "with det R = 1"
         )
-    if np.abs(matrix[:3, 3]).max() > 20:
-        raise ValueError(f"it puts the camera {np.abs(matrix[:3, 3]).max():.0f} m away; translations are metres")
+    if not np.abs(matrix[:3, 3]).max() <= 20:
+        raise ValueError(f"it translates by {np.abs(matrix[:3, 3]).max():.0f} m; give metres")
     return rows
+
+
+def read_transform(path: Path) -> NDArray[np.float64]:
+    """Read a rigid transform [4, 4] from a text file of four rows. Spaces or commas separate the numbers.
+
+    Raises:
+        EpisodeError: the file is not readable, or its matrix is not a rigid transform in metres.
+    """
+    with open_input(path, kind="transform file", error=EpisodeError, most_bytes=_LARGEST_TRANSFORM) as stream:
+        content = stream.read()
+    try:
+        rows = [[number(word) for word in line.replace(",", " ").split()] for line in content.decode().splitlines()]
+        return np.array(_rigid([row for row in rows if row]))
+    except ValueError as error:
+        raise EpisodeError(f"{path} holds no rigid transform: {error}.") from error
 
 
 RigidTransform = Annotated[list[list[Component]], AfterValidator(_rigid)]

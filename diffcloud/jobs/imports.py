@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from diffcloud.console import errors, warn, writes
 from diffcloud.errors import ConfigError, EpisodeError
+from diffcloud.io.camera_models import read_transform
 from diffcloud.io.clouds import FORMATS
 from diffcloud.io.depth_folders import depth_folders
 from diffcloud.io.episodes import Episode, write_episode
@@ -31,11 +32,13 @@ from diffcloud.io.ros.recording import ros_recording
 from diffcloud.io.ros.surfaces import is_cloud_recording, ros_clouds
 from diffcloud.io.urdf import RobotDescription, read_urdf
 from diffcloud.sensing.agreement import agreement, corrected
-from diffcloud.sensing.filters import without_strays
+from diffcloud.sensing.filters import cropped, transformed, without_strays
 from diffcloud.sensing.fusion import FusionSettings
 from diffcloud.sensing.tool_poses import turning
 from diffcloud.sensing.visible_region import with_cut_planes
 
+Box = tuple[NDArray[np.float64], NDArray[np.float64]]
+"""Lowest and highest corner [3] [m]."""
 _FARTHEST_M = 50.0
 """Largest plausible distance of a point from the robot's base."""
 _KINDS = {
@@ -51,6 +54,8 @@ _RECORDINGS = ("ros", "realsense", "folder")
 _OF = {
     "--gripper": ("clouds",),
     "--camera": ("clouds", "ros_clouds"),
+    "--transform": ("clouds",),
+    "--crop": ("clouds", "ros_clouds"),
     "--rate-hz": ("clouds", "folder"),
     "--label": ("clouds", "ros_clouds", *_RECORDINGS),
     "--joint-log": _RECORDINGS,
@@ -174,22 +179,40 @@ def import_clouds(
     rate_hz: float | None,
     labels: dict[str, str],
     viewpoints: dict[str, list[float]],
+    transform: Path | None = None,
+    box: Box | None = None,
 ) -> dict[str, Any]:
-    """Write a folder of clouds and gripper tracks as an episode. Return the file name and counts."""
+    """Write a folder of clouds and gripper tracks as an episode. Return the file name and counts.
+
+    Args:
+        transform: text file of the matrix [4, 4] from the frame of the clouds to the robot's frame.
+        box: see `crop_box`.
+    """
     meta: dict[str, Any] = {**labels, **({"viewpoints": viewpoints} if viewpoints else {})}
     episode = cloud_folder(folder, grippers=named_files(gripper) if gripper else None, rate_hz=rate_hz, meta=meta)
+    if transform is not None:
+        episode = transformed(episode, read_transform(transform))
     _refuse_far(episode, folder)
-    return _write_clouds(out, episode)
+    return _write_clouds(out, episode if box is None else cropped(episode, *box))
 
 
 @writes(".npz")
 def import_ros_clouds(
-    paths: list[Path], out: Path, choices: dict[str, Any], labels: dict[str, str], viewpoints: dict[str, list[float]]
+    paths: list[Path],
+    out: Path,
+    choices: dict[str, Any],
+    labels: dict[str, str],
+    viewpoints: dict[str, list[float]],
+    box: Box | None = None,
 ) -> dict[str, Any]:
-    """Write a ROS recording of clouds as an episode; file, counts and warnings, for the result."""
+    """Write a ROS recording of clouds as an episode; file, counts and warnings, for the result.
+
+    Args:
+        box: see `crop_box`.
+    """
     meta: dict[str, Any] = {**labels, **({"viewpoints": viewpoints} if viewpoints else {})}
     episode, warnings = cloud_recording(paths, {**choices, "meta": meta})
-    return {**_write_clouds(out, episode), "warnings": warnings}
+    return {**_write_clouds(out, episode if box is None else cropped(episode, *box)), "warnings": warnings}
 
 
 def cloud_recording(paths: list[Path], choices: dict[str, Any]) -> tuple[Episode, list[str]]:
@@ -415,6 +438,26 @@ def _with_log(found: Recording, path: Path, offset_s: float) -> Recording:
     start = 0.0 if first is None else first.time_s
     log = read_joint_log(path, offset_s=offset_s, recording_start_s=start)
     return replace(found, frames=frames if first is None else chain([first], frames), robot=log)
+
+
+def crop_box(text: str | None) -> Box | None:
+    """Parse X,Y,Z:X,Y,Z to the lowest and the highest corner [3] of a box [m].
+
+    Raises:
+        ConfigError: the text has another form, or the box has no volume.
+    """
+    if text is None:
+        return None
+    try:
+        corners = np.array([[float(part) for part in corner.split(",")] for corner in text.split(":")])
+    except ValueError:
+        corners = np.empty(0)
+    if corners.shape != (2, 3) or not np.isfinite(corners).all() or not np.ptp(corners, axis=0).all():
+        raise ConfigError(
+            "--crop takes two opposite corners of a box in metres, X,Y,Z:X,Y,Z, as in 0.3,-0.4,0.01:0.9,0.4,0.8; "
+            f"got {text!r}."
+        )
+    return corners.min(axis=0), corners.max(axis=0)
 
 
 def viewpoints(items: list[str] | None) -> dict[str, list[float]]:

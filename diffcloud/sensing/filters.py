@@ -14,6 +14,7 @@ from scipy.spatial import cKDTree
 from diffcloud.errors import EpisodeError
 from diffcloud.io.clouds import import_open3d
 from diffcloud.io.episodes import Episode
+from diffcloud.sensing.cameras import transform
 
 Downsampling = Literal["random", "voxel", "farthest"]
 """`random`: random points. `voxel`: the most central point of each voxel. `farthest`: farthest-point sampling."""
@@ -122,6 +123,28 @@ def in_large_clusters(points: NDArray[np.floating[Any]], gap: float, least_part:
     size = np.bincount(cluster)
     kept: NDArray[np.bool_] = size[cluster] >= least_part * size.max()
     return kept
+
+
+def transformed(episode: Episode, matrix: NDArray[np.float64]) -> Episode:
+    """Return the episode with its clouds carried by a rigid transform [4, 4]. Grippers and viewpoints stay."""
+    points = transform(matrix, episode.points.astype(np.float64))
+    return replace(episode, points=points.astype(np.float32))
+
+
+def cropped(episode: Episode, low: NDArray[np.float64], high: NDArray[np.float64]) -> Episode:
+    """Remove the points outside a box with these corners [3].
+
+    Raises:
+        EpisodeError: a frame has no points in the box.
+    """
+    kept = ((episode.points >= low) & (episode.points <= high)).all(axis=1)
+    counts = np.add.reduceat(kept, episode.offsets[:-1], dtype=np.int64)
+    if len(empty := np.flatnonzero(counts == 0)):
+        raise EpisodeError(
+            f"{len(empty)} of {len(counts)} frames have no points in the box from {low.tolist()} to {high.tolist()}, the "
+            f"first one is frame {empty[0]}. Its points span {_span(episode.frame(int(empty[0])))}."
+        )
+    return episode.select(kept)
 
 
 def without_strays(episode: Episode, gap: float) -> Episode:

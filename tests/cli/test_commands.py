@@ -31,6 +31,7 @@ from diffcloud.io.obj import read_cloth, read_surface
 from diffcloud.io.timings import read_seconds
 from diffcloud.jobs.scenarios import scene_named
 from diffcloud.scene.scenarios import load_scenario
+from diffcloud.sensing.cameras import inverse, looking_at, transform
 from diffcloud.sim.properties import one_set
 from tests.arcsim.files import MESHES, over_moving_box, write_file, write_files
 from tests.cli.invoke import DIFFCLOUD, ROOT, Invoked, environment, invoke, stage, study, wait_for
@@ -421,6 +422,59 @@ def test_import_own_clouds_end_to_end(work):
     again = read_episode(work / "own.npz")
     np.testing.assert_allclose(again.points, episode.points, atol=1e-6)
     run("fit", "--scene", "small.yaml", "--out", "fits", "--max-steps", 1, "own.npz", cwd=work)
+
+
+class TestCloudsOfACamera:
+    """Clouds in the frame of a camera, with a wall behind the cloth."""
+
+    @pytest.fixture
+    def folder(self, work):
+        pose = looking_at([1.0, -0.5, 0.8], [0.0, 0.0, 0.0])
+        episode, wall = read_episode(work / "e1.npz"), np.array([[-2.0, 0.0, 0.5], [-2.0, 0.3, 0.6]])
+        (work / "clouds").mkdir()
+        for index in range(episode.frame_count):
+            points = transform(inverse(pose), np.vstack([episode.frame(index), wall]).astype(np.float64))
+            np.savetxt(work / "clouds" / f"{index:03d}.xyz", points, fmt="%.9f")
+        np.savetxt(work / "camera.txt", pose)
+        return work
+
+    def test_they_become_those_of_the_cloth_in_the_robots_frame(self, folder):
+        options = ("--rate-hz", 10, "--transform", "camera.txt", "--crop", "1,1,1:-1,-1,-1")
+        run("data", "import", "clouds", *options, "--camera", "side=1,-0.5,0.8", "--out", "own.npz", cwd=folder)
+        found, episode = read_episode(folder / "own.npz"), read_episode(folder / "e1.npz")
+        np.testing.assert_array_equal(found.offsets, episode.offsets)
+        np.testing.assert_allclose(found.points, episode.points, atol=1e-6)
+        assert found.meta["viewpoints"] == {"side": [1.0, -0.5, 0.8]}
+
+    @pytest.mark.parametrize("text", ["1,1,1", "0,0,0:1,1", "0,0,0:1,1,0", "0,0,0:1,1,nan", "a,b,c:1,1,1"])
+    def test_a_box_that_is_none(self, folder, text):
+        refused = run("data", "import", "clouds", "--rate-hz", 10, "--crop", text, "--out", "own.npz", cwd=folder, code=1)
+        assert "--crop takes two opposite corners of a box in metres" in refused.errors
+
+    def test_a_box_beside_the_cloth(self, folder):
+        options = ("--rate-hz", 10, "--transform", "camera.txt", "--crop", "5,5,5:6,6,6", "--out", "own.npz")
+        refused = run("data", "import", "clouds", *options, cwd=folder, code=1)
+        assert (
+            "have no points in the box from [5.0, 5.0, 5.0] to [6.0, 6.0, 6.0], the first one is frame 0" in refused.errors
+        )
+        assert not (folder / "own.npz").exists()
+
+    @pytest.mark.parametrize(
+        ("text", "said"),
+        [
+            ("1 0 0 0\n0 1 0 0\n0 0 1 0", "it must be 4 x 4 numbers"),
+            ("2 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1", "it is not a rigid transform"),
+            ("1 0 0 nan\n0 1 0 0\n0 0 1 0\n0 0 0 1", "it translates by nan m"),
+            ("1 0 0 900\n0 1 0 0\n0 0 1 0\n0 0 0 1", "it translates by 900 m; give metres"),
+            ("1 0 0 x\n0 1 0 0\n0 0 1 0\n0 0 0 1", "'x' is not a number"),
+            ("9" * 20_000, "camera.txt"),
+        ],
+    )
+    def test_a_file_without_a_transform(self, folder, text, said):
+        (folder / "camera.txt").write_text(text)
+        options = ("--rate-hz", 10, "--transform", "camera.txt", "--out", "own.npz")
+        assert said in run("data", "import", "clouds", *options, cwd=folder, code=1).errors
+        assert not (folder / "own.npz").exists()
 
 
 def test_stages_run_in_a_row_and_the_page_is_whole(work):
