@@ -189,7 +189,7 @@ class _Announcement(event.Listener):
         if not self.silent and (function.__module__ or "").startswith("diffcloud"):
             self.silent = True
             _log.warning(
-                "Compiling kernels, once for this version and computer (about a minute); kept in %s.", cache_folder()
+                "Compiling kernels, once for this version and computer (up to five minutes); kept in %s.", cache_folder()
             )
 
     def on_end(self, compiling: Any) -> None:

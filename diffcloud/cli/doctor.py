@@ -17,7 +17,7 @@ def doctor(
     arm: Annotated[str | None, typer.Option(help="Address of the arm, to see whether it answers.")] = None,
     folder: Annotated[Path, typer.Option(help="Where episodes would be written.")] = Path("."),
     compile_: Annotated[
-        bool, typer.Option("--compile", help="Compile the kernels now rather than at first use (about a minute).")
+        bool, typer.Option("--compile", help="Compile the kernels now rather than at first use (up to five minutes).")
     ] = False,
     json: JsonFlag = False,
 ) -> None:

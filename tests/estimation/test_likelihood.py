@@ -14,6 +14,7 @@ from diffcloud.errors import DivergedError
 from diffcloud.estimation.joint import JointObjective
 from diffcloud.estimation.likelihood import Answer, Estimate, LikelihoodSettings, energy
 from diffcloud.estimation.likelihood.energy import Likelihood, up_to_horizon
+from diffcloud.estimation.likelihood.estimate import places_beside
 from diffcloud.estimation.likelihood.frames import Frames
 from diffcloud.estimation.likelihood.grasp import in_powers, regripped, that_fits
 from diffcloud.estimation.likelihood.recording import Changes, Linear
@@ -243,6 +244,24 @@ class TestMixture:
         found = Estimate(FitSpace((SPACE.variables[0],), {}), self.answers(0.0, 40.0), (), (), None, 2)
         assert float(found.mean) < 1e-8
         assert float(found.covariance) == pytest.approx(0.5, abs=1e-7)
+
+
+class TestStartsBesideAResult:
+    def test_the_other_variables_are_the_most_likely_ones(self, found):
+        """Of a quadratic Φ, whose slope there is along the first variable alone."""
+        best, likelihood = found.estimate.best, Likelihood([objective(FINE)], SPACE, LikelihoodSettings())
+        for side, place in zip((1, -1), places_beside(best, likelihood), strict=True):
+            away = place - best.place
+            assert float(away[0]) == pytest.approx(2 * side * float(best.covariance[0, 0].sqrt()))
+            slope = torch.linalg.solve(best.covariance, away)
+            torch.testing.assert_close(slope[1:], torch.zeros_like(slope[1:]), rtol=0.0, atol=1e-9)
+
+    def test_their_results_are_mixed_in(self, found):
+        counts = [
+            len(one.estimate.answers) for one in (found, fit_likelihood(objective(), SPACE, LikelihoodSettings(starts=1)))
+        ]
+        assert counts[0] in (4, 5)
+        assert counts[1] == 1
 
 
 class TestFits:

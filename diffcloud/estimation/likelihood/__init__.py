@@ -22,7 +22,8 @@ exceeds 2 in a frame, the descents continue without that frame and the later one
 
 The variables are those of the space, the pose of each recording, and the size of the grasp if it is unknown. The effect
 of the grasp size is interpolated between three sizes, which are centred on the result of the first start. Gauss–Newton
-steps with a bound in each variable are taken from three starts. The results are weighted by their likelihoods.
+steps with a bound in each variable are taken from three starts, and then from both sides of the best result, because late
+frames give Φ many local minima. The results are weighted by their likelihoods.
 """
 
 from diffcloud.estimation.likelihood.descent import Answer

@@ -23,6 +23,9 @@ from diffcloud.estimation.residuals import Axis
 
 _START = math.log(4.5)
 """Distance between starts, in the logarithm of the first variable (usually stretching)."""
+_BESIDE = 2.0
+"""Distance of the last two starts from the best result, in standard deviations of the first variable. With them, the
+intervals of ten towels that MuJoCo moved hold nine true values instead of seven, for a fifth more time."""
 _REGRIP = 0.3
 """The fit continues with a new grasp size if the first start changes it by more standard deviations than this."""
 
@@ -80,6 +83,14 @@ class Estimate:
         """Parameter values of the most likely result."""
         axis = Axis.of(self.space)
         return dict(zip(self.space.names, axis.bounded(self.best.place[: len(self.space.names)]).tolist(), strict=True))
+
+
+def places_beside(answer: Answer, likelihood: Likelihood) -> list[Tensor]:
+    """Return two places [K] at which the first requested variable is `_BESIDE` standard deviations above and below a
+    result. The other variables are the most likely ones there, if Φ were quadratic."""
+    column = answer.covariance[:, likelihood.asked[0]]
+    away = _BESIDE * column / column[likelihood.asked[0]].sqrt()
+    return [likelihood.inside(answer.place + side * away) for side in (1, -1)]
 
 
 @torch.no_grad()
@@ -151,6 +162,11 @@ def estimate(
             likelihood, answers = shorter, [one for one in again if one is not None]
             pairs = zip(shorter.recordings, horizon, strict=True)
             departs = [len(one.objective.frames) < len(whole.objective.frames) for one, whole in pairs]
+        if settings.model_error and settings.starts > 1 and answers:
+            for place in places_beside(min(answers, key=lambda one: one.energy), likelihood):
+                found = follow(settings.starts, place, likelihood, min(one.energy for one in answers))
+                if found is not None:
+                    answers.append(found)
         every = sum(len(one.frames) for one in objective.members)
         if answers and not settings.model_error and likelihood.frames < every:
             best = min(answers, key=lambda one: one.energy)
