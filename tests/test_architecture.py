@@ -260,7 +260,7 @@ def test_seven_commands_with_few_options():
 
     top = get_command(app)
     assert len(top.list_commands(None)) == 7
-    assert options(top) <= 136
+    assert options(top) <= 138
 
 
 def test_the_light_settings_of_networks_take_what_the_networks_take():
