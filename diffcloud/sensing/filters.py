@@ -137,7 +137,7 @@ def cropped(episode: Episode, low: NDArray[np.float64], high: NDArray[np.float64
     Raises:
         EpisodeError: a frame has no points in the box.
     """
-    kept = ((episode.points >= low) & (episode.points <= high)).all(axis=1)
+    kept = np.all((episode.points >= low) & (episode.points <= high), axis=1)
     counts = np.add.reduceat(kept, episode.offsets[:-1], dtype=np.int64)
     if len(empty := np.flatnonzero(counts == 0)):
         raise EpisodeError(
