@@ -121,7 +121,7 @@ SETS = (
     Set("vests", "vests of one layer, lifted by a strap; mesh, pad and track told", kind="vest", most=3),
     Set("skirts", "skirts of one layer, lifted at the waist; mesh, pad and track told", kind="skirt", most=3),
     Set("pairs", "held at two corners by two grippers; size, pad and tracks told", kind="pair", most=6),
-    Set("finer", "the same lifts, moved by this simulator on 49 × 37 nodes", simulator="diffcloud", most=40),
+    Set("finer", "the lifts of towels, moved by this simulator on 49 × 37 nodes", simulator="diffcloud", most=40),
     Set("joint", "two lifts of each towel, fitted together", motions=(0, 1), most=10),
 )
 

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 _FITTING = 0.9
 """Part of the time of --budget after which fits end: the report needs some, too."""
 _NOT_OF_PROJECT = ("recordings", "out", "size", "mesh", "topic", "separate", "dvc", "params", "json")
-"""Parameters that do not belong to the command of a DVC project. What they found is in the folder."""
+"""Parameters that are not copied to the params.yaml of a DVC project. Its files take their place."""
 
 
 @settings_options(

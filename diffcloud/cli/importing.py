@@ -56,14 +56,12 @@ def import_(
     ] = None,
     transform: Annotated[
         Path | None,
-        typer.Option(help="Clouds: text file of the 4 x 4 matrix from the frame of the clouds to the robot's frame."),
+        typer.Option(help="Clouds: text file of the 4 x 4 matrix from their frame to the robot's frame."),
     ] = None,
     crop: Annotated[
         str | None,
         typer.Option(
-            metavar="X,Y,Z:X,Y,Z",
-            help="Clouds, also of ROS: opposite corners of a box in the robot's frame, in metres. Points outside are "
-            "removed.",
+            help="Clouds, also of ROS: box that is kept, X,Y,Z:X,Y,Z. Opposite corners in m, in the robot's frame."
         ),
     ] = None,
     label: Annotated[

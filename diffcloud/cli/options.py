@@ -108,7 +108,7 @@ def settings_options(
 
 
 def typed_options(context: typer.Context, but: Sequence[str]) -> list[str]:
-    """The words of the options that were typed, without the parameters of these names."""
+    """Return the typed options as words of a command line, except the parameters named in `but`."""
     words = []
     for option in context.command.params:
         name = option.name or ""

@@ -192,7 +192,7 @@ class Followed(_Model):
     horizon_s: float
     """Frames after this time were not used [s]."""
     departs: bool = False
-    """Whether the horizon is the last frame before the simulation departs from the recording."""
+    """Whether the horizon is earlier because the simulation departs from the recording."""
     chi_squares: list[NonNegative]
     """Mean squared distance of each used frame, divided by the variance expected from noise, point spacing and mesh."""
     finer_mm: list[NonNegative]

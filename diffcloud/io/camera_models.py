@@ -162,7 +162,7 @@ def read_transform(path: Path) -> NDArray[np.float64]:
         rows = [[number(word) for word in line.replace(",", " ").split()] for line in content.decode().splitlines()]
         return np.array(_rigid([row for row in rows if row]))
     except ValueError as error:
-        raise EpisodeError(f"{path} holds no rigid transform: {error}.") from error
+        raise EpisodeError(f"{path}: {error}.") from error
 
 
 RigidTransform = Annotated[list[list[Component]], AfterValidator(_rigid)]

@@ -192,8 +192,10 @@ def import_clouds(
     episode = cloud_folder(folder, grippers=named_files(gripper) if gripper else None, rate_hz=rate_hz, meta=meta)
     if transform is not None:
         episode = transformed(episode, read_transform(transform))
+    if box is not None:
+        episode = cropped(episode, *box)
     _refuse_far(episode, folder)
-    return _write_clouds(out, episode if box is None else cropped(episode, *box))
+    return _write_clouds(out, episode)
 
 
 @writes(".npz")
@@ -454,7 +456,7 @@ def crop_box(text: str | None) -> Box | None:
         corners = np.empty(0)
     if corners.shape != (2, 3) or not np.isfinite(corners).all() or not np.ptp(corners, axis=0).all():
         raise ConfigError(
-            "--crop takes two opposite corners of a box in metres, X,Y,Z:X,Y,Z, as in 0.3,-0.4,0.01:0.9,0.4,0.8; "
+            "--crop takes X,Y,Z:X,Y,Z in metres, two corners that differ in x, y and z, as in 0.3,-0.4,0.01:0.9,0.4,0.8; "
             f"got {text!r}."
         )
     return corners.min(axis=0), corners.max(axis=0)

@@ -126,7 +126,7 @@ def in_large_clusters(points: NDArray[np.floating[Any]], gap: float, least_part:
 
 
 def transformed(episode: Episode, matrix: NDArray[np.float64]) -> Episode:
-    """Return the episode with its clouds carried by a rigid transform [4, 4]. Grippers and viewpoints stay."""
+    """Apply a rigid transform [4, 4] to the clouds of an episode, but not to grippers and viewpoints."""
     points = transform(matrix, episode.points.astype(np.float64))
     return replace(episode, points=points.astype(np.float32))
 
@@ -141,8 +141,8 @@ def cropped(episode: Episode, low: NDArray[np.float64], high: NDArray[np.float64
     counts = np.add.reduceat(kept, episode.offsets[:-1], dtype=np.int64)
     if len(empty := np.flatnonzero(counts == 0)):
         raise EpisodeError(
-            f"{len(empty)} of {len(counts)} frames have no points in the box from {low.tolist()} to {high.tolist()}, the "
-            f"first one is frame {empty[0]}. Its points span {_span(episode.frame(int(empty[0])))}."
+            f"{len(empty)} of {len(counts)} frames have no points in the box from {low.tolist()} to {high.tolist()} m. "
+            f"The first one is frame {empty[0]}. Its points span {_span(episode.frame(int(empty[0])))} m."
         )
     return episode.select(kept)
 

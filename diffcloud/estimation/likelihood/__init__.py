@@ -12,18 +12,18 @@ is twice the negative log-posterior, for n independent residuals per frame. Mode
 so n is much smaller than the number of points.
 
 After some time the folding of a cloth is unpredictable, and derivatives explode. Frames are therefore used only up to a
-horizon, at which the refined mesh moves differently from the given one. The refined mesh also corrects the positions:
+horizon, at which the motions of the refined and the given mesh differ. The refined mesh also corrects the positions:
 its displacement is added to the simulated nodes. Half of this displacement is treated as an uncertainty. Recordings
 that this simulator made on the same mesh need no correction. For them the horizon only limits the descents, and the
 best result is refined on all frames if possible.
 
-A model may also depart from the recording earlier, for example because its contact is wrong. If c of the best result
+The simulation may depart from the recording earlier, for example because its contact is wrong. If c of the best result
 exceeds 2 in a frame, the descents continue without that frame and the later ones.
 
 The variables are those of the space, the pose of each recording, and the size of the grasp if it is unknown. The effect
 of the grasp size is interpolated between three sizes, which are centred on the result of the first start. Gauss–Newton
-steps with a bound in each variable are taken from three starts, and then from both sides of the best result, because late
-frames give Φ many local minima. The results are weighted by their likelihoods.
+steps, bounded in each variable, run from three starts, and then from two beside the best result. Late frames give Φ many
+local minima. The results are weighted by their likelihoods.
 """
 
 from diffcloud.estimation.likelihood.descent import Answer
