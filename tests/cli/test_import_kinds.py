@@ -23,7 +23,7 @@ from tests.sensing.table_scene import write_table_episode
 VALUES = {
     "--gripper": "g.csv", "--camera": "side=1,0,0", "--rate-hz": 10, "--label": "fabric=tan", "--joint-log": "log.csv",
     "--clock-offset": 1, "--world-frame": "map", "--tool-frame": "tool", "--joints": "a,b", "--gripper-joint": "none",
-    "--topic": "/tf", "--urdf": "arm.urdf", "--trajectories": "trajs",
+    "--topic": "/tf", "--urdf": "arm.urdf", "--trajectories": "trajs", "--transform": "camera.txt", "--crop": "0,0,0:1,1,1",
 }  # fmt: skip
 
 
@@ -77,7 +77,7 @@ def test_options_of_other_kinds_are_refused(tmp_path, kind, option):
 def test_every_option_has_its_kinds():
     options = {option for parameter in reference.commands()["data", "import"].params for option in parameter.opts}
     assert options - {"source", "--out", "--kind", "--json"} == set(_OF) == set(VALUES)
-    assert len(options - {"source"}) == 16
+    assert len(options - {"source"}) == 18
 
 
 def test_the_gripper_that_the_help_states_is_the_default():

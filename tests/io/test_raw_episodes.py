@@ -252,7 +252,7 @@ def test_cameras_that_no_camera_is(tmp_path):
         ({"depth_scale_m": 1.0}, "metres per unit"),
         ({"T_world_camera": np.eye(3).tolist()}, "4 x 4 numbers"),
         ({"T_world_camera": np.diag([1, 1, -1, 1]).tolist()}, "not a rigid transform"),
-        ({"T_world_camera": (np.eye(4) + 700 * np.eye(4, k=3)).tolist()}, "translations are metres"),
+        ({"T_world_camera": (np.eye(4) + 700 * np.eye(4, k=3)).tolist()}, "give metres"),
     ):
         path.write_text(json.dumps({**good, **changes}))
         with pytest.raises(EpisodeError, match=message):
