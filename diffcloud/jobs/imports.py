@@ -450,16 +450,22 @@ def crop_box(text: str | None) -> Box | None:
     """
     if text is None:
         return None
-    try:
-        corners = np.array([[float(part) for part in corner.split(",")] for corner in text.split(":")])
-    except ValueError:
-        corners = np.empty(0)
-    if corners.shape != (2, 3) or not np.isfinite(corners).all() or not np.ptp(corners, axis=0).all():
+    corners = [_point(corner) for corner in text.split(":")]
+    if len(corners) != 2 or not all(corners) or not np.ptp(corners, axis=0).all():
         raise ConfigError(
             "--crop takes X,Y,Z:X,Y,Z in metres, two corners that differ in x, y and z, as in 0.3,-0.4,0.01:0.9,0.4,0.8; "
             f"got {text!r}."
         )
-    return corners.min(axis=0), corners.max(axis=0)
+    return np.min(corners, axis=0), np.max(corners, axis=0)
+
+
+def _point(text: str) -> list[float]:
+    """Parse X,Y,Z to finite coordinates [3] [m]. Return an empty list if the text has another form."""
+    try:
+        place = [float(part) for part in text.split(",")]
+    except ValueError:
+        return []
+    return place if len(place) == 3 and all(map(math.isfinite, place)) else []
 
 
 def viewpoints(items: list[str] | None) -> dict[str, list[float]]:
@@ -471,11 +477,8 @@ def viewpoints(items: list[str] | None) -> dict[str, list[float]]:
     found: dict[str, list[float]] = {}
     for item in items or []:
         name, _, text = item.partition("=")
-        try:
-            place = [float(part) for part in text.split(",")]
-        except ValueError:
-            place = []
-        if not name or name in found or len(place) != 3 or not all(map(math.isfinite, place)):
+        place = _point(text)
+        if not name or name in found or not place:
             raise ConfigError(f"--camera takes NAME=X,Y,Z in metres, each camera once, as in side=1.2,0,0.5; got {item!r}.")
         found[name] = place
     return found

@@ -7,7 +7,6 @@ import json
 import shutil
 import signal
 import subprocess
-import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -26,7 +25,7 @@ from diffcloud.io.episodes import read_episode, write_episode
 from diffcloud.io.simulated import write_simulated
 from diffcloud.regressors import Regressor
 from diffcloud.regressors.training import train_regressor
-from tests.cli.invoke import DIFFCLOUD, environment
+from tests.cli.invoke import DIFFCLOUD, environment, wait_for
 from tests.cli.test_commands import SMALL
 from tests.conftest import small_lift
 from tests.estimation.test_fit import clouds_of
@@ -210,8 +209,7 @@ def test_an_interrupted_training_goes_on(work):
     process = subprocess.Popen([*DIFFCLOUD, *TRAIN], cwd=work, env=env, stderr=subprocess.PIPE, text=True)
     metrics = work / "data/regressors/small/mlp/metrics.json"
     assert "Training small/mlp" in process.stderr.readline()
-    while process.poll() is None and not metrics.exists():  # until an epoch is done
-        time.sleep(0.05)
+    wait_for(metrics.exists, process)  # until an epoch is done
     process.send_signal(signal.SIGINT)
     _, errors = process.communicate(timeout=60)
     assert process.returncode == 130, errors
