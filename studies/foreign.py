@@ -437,6 +437,12 @@ class Case:
     """Of processor time."""
     message: str
     revision: str
+    bending: tuple[float, float, float] | None = None
+    """True value and ends of the interval of bending [N·m]. None for Newton, whose law differs, and without an interval."""
+
+    @property
+    def bending_held(self) -> bool:
+        return self.bending is not None and self.bending[1] <= self.bending[0] <= self.bending[2]
 
     @property
     def held(self) -> bool:
@@ -485,6 +491,10 @@ def fitted(one: Set, seed: int, out: Path, revision: str) -> Case:
     stated = found["low"] is not None
     low, high = (found["low"], found["high"]) if stated else (found["value"], found["value"])
     upper = stated and high >= _upper(folder / "found")
+    bent = told["parameters"]["bending"]
+    bending = None
+    if one.simulator != "newton" and bent["low"] is not None:
+        bending = (cloths[0].sheet.bending, bent["low"], bent["high"])
     return Case(
         one.name,
         seed,
@@ -498,6 +508,7 @@ def fitted(one: Set, seed: int, out: Path, revision: str) -> Case:
         seconds,
         told["reason"],
         revision,
+        bending,
     )
 
 
@@ -614,7 +625,16 @@ def _line(case: Case) -> str:
 
 
 def _page(cases: Sequence[Case], seed: int, count: int, revision: str) -> str:
-    head = ["set", "held", "median abs. log error", "mean log error", "median half-width", "RMS of z", "CPU s"]
+    head = [
+        "set",
+        "held",
+        "median abs. log error",
+        "mean log error",
+        "median half-width",
+        "RMS of z",
+        "bending held",
+        "CPU s",
+    ]
     rows = []
     for one in SETS:
         own = [case for case in cases if case.set == one.name]
@@ -641,7 +661,8 @@ def _page(cases: Sequence[Case], seed: int, count: int, revision: str) -> str:
         markdown_table(head, rows),
         note=f"Random cloths of {COLUMNS} × {ROWS} nodes are moved by MuJoCo or Newton, without air, and seen by depth "
         f"cameras with {1e3 * _NOISE:.0f} mm of noise. `diffcloud fit` estimates the stretching stiffness with known "
-        "density and unknown friction and bending. Odd seeds have wide ranges of material: 3 to 2,000 N/m. *Held* "
+        "density and unknown friction and bending. *Bending held* counts intervals of bending, all other columns are "
+        "about stretching. Odd seeds have wide ranges of material: 3 to 2,000 N/m. *Held* "
         "counts intervals that contain the true value; a fit without an interval counts as not held. Errors are "
         "logarithms, half-widths are "
         "factors.\n\n" + "\n".join(f"- *{one.name}*: {one.about}." for one in sets),
@@ -658,12 +679,14 @@ def _summary(cases: Sequence[Case]) -> list[str]:
     errors = np.array([case.error for case in stated])
     factors = [case.factor for case in stated]
     z = np.array([case.z for case in stated])
+    bent = [case for case in cases if case.bending is not None]
     return [
         f"{sum(case.held for case in cases)} of {len(cases)}",
         f"{np.median(np.abs(errors)):.2f}" if stated else "",
         f"{errors.mean():+.2f}" if stated else "",
         f"{np.median(factors):.2f}" if stated else "",
         f"{np.sqrt((z**2).mean()):.2f}" if stated else "",
+        f"{sum(case.bending_held for case in bent)} of {len(bent)}" if bent else "",
         f"{np.median([case.seconds for case in cases]):.0f}",
     ]
 

@@ -155,7 +155,7 @@ class TestDeparture:
         squares = [0.5] * 12
         assert member.before_departure([squares]) is None
         for first, count in ((8, 8), (2, 5)):
-            shorter = member.before_departure([[*squares[:first], 2.1, *squares[first + 1 :]]])
+            shorter = member.before_departure([[*squares[:first], 1.6, *squares[first + 1 :]]])
             assert shorter.frames == count
         assert member.earliest([5]).before_departure([[9.0] * 5]) is None
 

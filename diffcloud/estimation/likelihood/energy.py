@@ -19,9 +19,9 @@ from diffcloud.estimation.parameters import FitSpace
 from diffcloud.estimation.residuals import Axis
 from diffcloud.sim.threads import map_threads
 
-FOLLOWS = 2.0
-"""Largest c of a frame in which the simulation follows the recording. Of ten independent residuals with known variances, c
-is above 2 in 3 % of all frames."""
+FOLLOWS = 1.5
+"""Largest c of a frame in which the simulation follows the recording. Beyond it, unknown model errors exceed half of the
+known variance."""
 _PART_M, _GONE_M = 0.004, 0.010
 """RMS displacement by mesh refinement [m] at the horizon, after `_LEAST_S` and before."""
 _LEAST_S = 1.2
@@ -38,6 +38,26 @@ _FAR_GRIP = 2.0
 """Bound on the grasp size, in standard deviations. Its effect is interpolated between -1 and 1."""
 _EDGE = 1e-6
 """Minimum distance from a bound, in fit coordinates."""
+
+
+@dataclass(frozen=True)
+class Look:
+    """What scenario variants change at one point."""
+
+    place: Tensor
+    """[K] coordinates."""
+    asked: Tensor
+    """Indices of the requested variables."""
+    changes: Sequence[Changes]
+    """Of each recording."""
+
+    def distance(self, place: Tensor, deviations: Tensor | float) -> float:
+        """Return the largest distance of a requested variable from a point, in these deviations."""
+        return float(((place - self.place) / deviations)[self.asked].abs().max())
+
+    def at(self, chosen: Sequence[Sequence[int]]) -> Look:
+        """Return the same for some frames of each recording."""
+        return Look(self.place, self.asked, [one.at(own) for one, own in zip(self.changes, chosen, strict=True)])
 
 
 class Likelihood:
@@ -61,9 +81,7 @@ class Likelihood:
             count += len(objective.pose_space.names)
         asked = [index for index, one in enumerate(space.variables) if not one.nuisance]
         self.asked = torch.tensor(asked, dtype=torch.long)
-        self.changes = [Changes() for _ in self.recordings]
-        self.looked: Tensor | None = None
-        """Coordinates at which `changes` was last computed."""
+        self.looks = list[Look]()
         self.knows_grip = not any(one.regripped for one in self.recordings)
         self.poses = count - variables
         steps, poses = space.prior_steps(), torch.ones(self.poses + (not self.knows_grip), dtype=torch.float64)
@@ -113,9 +131,16 @@ class Likelihood:
         """Return the likelihood of the earliest frames, with this number of frames of each recording."""
         members = [one.objective.earliest([count]) for one, count in zip(self.recordings, counts, strict=True)]
         found = Likelihood(members, self.space, self.settings, self.grip)
+        chosen = list[list[int]]()
         for one, whole in zip(found.recordings, self.recordings, strict=True):
-            one.refined = whole.refined_in(one.objective.frames)
+            chosen.append([whole.objective.frames.index(frame) for frame in one.objective.frames])
+            one.refined = whole.refined_in(chosen[-1])
+        found.looks = [look.at(chosen) for look in self.looks]
         return found
+
+    def nearest(self, place: Tensor, deviations: Tensor | float = 1.0) -> Look | None:
+        """Return the look nearest to a point, in these deviations; None if there is none."""
+        return min(self.looks, key=lambda one: one.distance(place, deviations), default=None)
 
     def start(self, init: Mapping[str, float], offset: float) -> Tensor:
         """Return start coordinates [K] from these values, or else from the centres of the priors.

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -20,6 +20,8 @@ from diffcloud.estimation.likelihood.settings import LikelihoodSettings
 from diffcloud.estimation.objective import Objective
 from diffcloud.estimation.parameters import FitSpace
 from diffcloud.estimation.residuals import Axis
+
+OnStep = Callable[[int, int, float, dict[str, float]], None]
 
 _START = math.log(4.5)
 """Distance between starts, in the logarithm of the first variable (usually stretching)."""
@@ -95,11 +97,7 @@ def places_beside(answer: Answer, likelihood: Likelihood) -> list[Tensor]:
 
 @torch.no_grad()
 def estimate(
-    objective: AnyObjective,
-    space: FitSpace,
-    settings: LikelihoodSettings,
-    *,
-    progress: Callable[[int, int, float, dict[str, float]], None] | None = None,
+    objective: AnyObjective, space: FitSpace, settings: LikelihoodSettings, *, progress: OnStep | None = None
 ) -> Estimate:
     """Estimate parameters and their uncertainty as `estimation.likelihood` describes.
 
@@ -114,83 +112,140 @@ def estimate(
         DivergedError: the motion diverges from every start.
         KeyboardInterrupt: Ctrl-C before the first iterate was evaluated.
     """
-    likelihood = up_to_horizon(objective.members, space, settings)
-    answers, failures, descent = list[Answer](), list[DivergedError](), None
-    simulated = [likelihood]
+    search = _Search(objective.members, space, settings, progress)
+    try:
+        search.run()
+    except KeyboardInterrupt:
+        search.interrupt()
+        return replace(search.estimate(), interrupted=True)
+    return search.estimate()
 
-    def follow(number: int, place: Tensor, likelihood: Likelihood, to_beat: float = math.inf) -> Answer | None:
-        nonlocal descent
+
+class _Search:
+    """Descents of one fit, and their results so far."""
+
+    def __init__(
+        self, members: Sequence[Objective], space: FitSpace, settings: LikelihoodSettings, progress: OnStep | None
+    ) -> None:
+        self.members, self.space, self.settings, self._progress = members, space, settings, progress
+        self.answers, self._failures = list[Answer](), list[DivergedError]()
+        self._descent: Descent | None = None
+        self._simulated = list[Likelihood]()
+        self.likelihood = self._counted(up_to_horizon(members, space, settings))
+        self.horizon = self.likelihood
+        """Likelihood of the frames before the motions of both meshes differ. That of `likelihood` may have fewer."""
+
+    @property
+    def best(self) -> Answer:
+        return min(self.answers, key=lambda one: one.energy)
+
+    def run(self) -> None:
+        """Run all descents.
+
+        Raises:
+            DivergedError: the motion diverges from every start.
+        """
+        for number in range(self.settings.starts):
+            self._start(number)
+            self._omit_departed()
+        if not self.answers:
+            raise self._failures[0]
+        if not self.settings.model_error:
+            self._use_all_frames()
+        elif self.settings.starts > 1:
+            self._look_beside()
+            self._omit_departed()
+
+    def interrupt(self) -> None:
+        """Take the last iterate as the result if no descent has ended.
+
+        Raises:
+            KeyboardInterrupt: there is no iterate.
+        """
+        if self.answers:
+            return
+        if self._descent is None or self._descent.reached is None:
+            raise KeyboardInterrupt
+        self.answers, self.likelihood = [self._descent.answer(converged=False)], self._descent.of
+
+    def estimate(self) -> Estimate:
+        """Return the result of the descents so far."""
+        answers, likelihood = sorted(self.answers, key=lambda one: one.energy), self.likelihood
+        counts = [len(one.objective.frames) for one in likelihood.recordings]
+        members, grip = [one.objective for one in likelihood.recordings], None
+        if not likelihood.knows_grip:
+            grip = that_fits(self.members, likelihood.grip + float(answers[0].place[-1]))
+            fixed = [known(one) for one in gripped(self.members, grip)]
+            members = [one.earliest([count]) for one, count in zip(fixed, counts, strict=True)]
+        whole = [len(one.objective.frames) for one in self.horizon.recordings]
+        departs = tuple(count < most for count, most in zip(counts, whole, strict=True))
+        simulations = sum(one.simulations for one in self._simulated)
+        return Estimate(self.space, tuple(answers), tuple(members), departs, grip, simulations)
+
+    def _start(self, number: int) -> None:
+        """Descend from one start. The first one may change the size of the grasp."""
+        away = _START * ((number + 1) // 2) * (1 if number % 2 else -1)
+        found = self._descend(number, self.likelihood.start(self.settings.init, away), self.likelihood)
+        if number == 0 and found is not None and not self.likelihood.knows_grip:
+            off = that_fits(self.members, float(found.place[-1]))
+            if abs(off) > _REGRIP:
+                place = torch.cat([found.place[:-1], torch.zeros(1, dtype=torch.float64)])
+                self.likelihood = self._counted(up_to_horizon(self.members, self.space, self.settings, off, place))
+                self.horizon = self.likelihood
+                found = self._descend(number, place, self.likelihood)
+        if found is not None:
+            self.answers.append(found)
+
+    def _omit_departed(self) -> None:
+        """Continue all descents without the frames in which the simulation has departed from a recording."""
+        while self.settings.model_error and self.answers:
+            shorter = self.likelihood.before_departure(self.best.chi_squares)
+            if shorter is None:
+                return
+            self._counted(shorter)
+            again = [self._descend(self.settings.starts, one.place, shorter, math.inf) for one in self.answers]
+            if not any(again):
+                return
+            self.likelihood, self.answers = shorter, [one for one in again if one is not None]
+
+    def _look_beside(self) -> None:
+        """Descend from two starts beside the best result."""
+        for place in places_beside(self.best, self.likelihood):
+            found = self._descend(self.settings.starts, place, self.likelihood)
+            if found is not None:
+                self.answers.append(found)
+
+    def _use_all_frames(self) -> None:
+        """Continue the best descent with all frames, and keep its result if it converges."""
+        if self.likelihood.frames == sum(len(one.frames) for one in self.members):
+            return
+        whole = self._counted(Likelihood(self.members, self.space, self.settings))
+        found = self._descend(self.settings.starts, self.best.place, whole, math.inf)
+        if found is not None and found.converged:
+            self.likelihood, self.answers = whole, [found]
+
+    def _counted(self, likelihood: Likelihood) -> Likelihood:
+        """Count the simulations of a likelihood."""
+        self._simulated.append(likelihood)
+        return likelihood
+
+    def _descend(self, number: int, place: Tensor, likelihood: Likelihood, to_beat: float | None = None) -> Answer | None:
+        """Return the result of a descent; None if it diverges or is abandoned.
+
+        Args:
+            to_beat: Φ above which it is abandoned. Default: that of the best result.
+        """
+        if to_beat is None:
+            to_beat = self.best.energy if self.answers else math.inf
 
         def tell(step: int, square: float, place: Tensor) -> None:
-            if progress is not None:
-                values = likelihood.axis.values(place[: len(space.names)]).tolist()
-                progress(number, step, square, dict(zip(space.names, values, strict=True)))
+            if self._progress is not None:
+                values = likelihood.axis.values(place[: len(self.space.names)]).tolist()
+                self._progress(number, step, square, dict(zip(self.space.names, values, strict=True)))
 
-        descent = Descent(likelihood, place, tell)
+        self._descent = Descent(likelihood, place, tell)
         try:
-            return descent.run(to_beat)
+            return self._descent.run(to_beat)
         except DivergedError as error:
-            failures.append(error)
+            self._failures.append(error)
             return None
-
-    interrupted, departs = False, [False] * len(objective.members)
-    try:
-        for number in range(settings.starts):
-            away = _START * ((number + 1) // 2) * (1 if number % 2 else -1)
-            lowest = min((one.energy for one in answers), default=math.inf)
-            found = follow(number, likelihood.start(settings.init, away), likelihood, lowest)
-            off = 0.0
-            if number == 0 and found is not None and not likelihood.knows_grip:
-                off = that_fits(objective.members, float(found.place[-1]))
-            if found is not None and abs(off) > _REGRIP:
-                place = torch.cat([found.place[:-1], torch.zeros(1, dtype=torch.float64)])
-                likelihood = up_to_horizon(objective.members, space, settings, off, place)
-                simulated.append(likelihood)
-                found = follow(number, place, likelihood)
-            if found is not None:
-                answers.append(found)
-        horizon = likelihood.recordings
-        while settings.model_error and answers:
-            best = min(answers, key=lambda one: one.energy)
-            shorter = likelihood.before_departure(best.chi_squares)
-            if shorter is None:
-                break
-            simulated.append(shorter)
-            again = [follow(settings.starts, one.place, shorter) for one in answers]
-            if not any(again):
-                break
-            likelihood, answers = shorter, [one for one in again if one is not None]
-            pairs = zip(shorter.recordings, horizon, strict=True)
-            departs = [len(one.objective.frames) < len(whole.objective.frames) for one, whole in pairs]
-        if settings.model_error and settings.starts > 1 and answers:
-            for place in places_beside(min(answers, key=lambda one: one.energy), likelihood):
-                found = follow(settings.starts, place, likelihood, min(one.energy for one in answers))
-                if found is not None:
-                    answers.append(found)
-        every = sum(len(one.frames) for one in objective.members)
-        if answers and not settings.model_error and likelihood.frames < every:
-            best = min(answers, key=lambda one: one.energy)
-            whole = Likelihood(objective.members, space, settings)
-            simulated.append(whole)
-            found = follow(settings.starts, best.place, whole)
-            if found is not None and found.converged:
-                likelihood, answers = whole, [found]
-    except KeyboardInterrupt:
-        interrupted = True
-        if not answers:
-            if descent is None or descent.reached is None:
-                raise
-            answers.append(descent.answer(converged=False))
-            likelihood = descent.of
-    if not answers:
-        raise failures[0]
-    answers.sort(key=lambda one: one.energy)
-    if likelihood.knows_grip:
-        members, grip = [one.objective for one in likelihood.recordings], None
-    else:
-        grip = that_fits(objective.members, likelihood.grip + float(answers[0].place[-1]))
-        counts = [len(one.objective.frames) for one in likelihood.recordings]
-        found_so = [known(one) for one in gripped(objective.members, grip)]
-        members = [one.earliest([count]) for one, count in zip(found_so, counts, strict=True)]
-    simulations = sum(one.simulations for one in simulated)
-    return Estimate(space, tuple(answers), tuple(members), tuple(departs), grip, simulations, interrupted)

@@ -70,12 +70,9 @@ class Recording:
         """The scenario with the refined mesh."""
         return self.objective.scenario.finer()
 
-    def refined_in(self, frames: Sequence[int]) -> tuple[Tensor, Tensor] | None:
-        """Return `refined` for a subset of the frames."""
-        if self.refined is None:
-            return None
-        chosen = [self.objective.frames.index(frame) for frame in frames]
-        return self.refined[0], self.refined[1][:, chosen]
+    def refined_in(self, chosen: Sequence[int]) -> tuple[Tensor, Tensor] | None:
+        """Return `refined` for some frames, given by their positions."""
+        return None if self.refined is None else (self.refined[0], self.refined[1][:, chosen])
 
     def change(self, place: Tensor, nodes: Tensor, variant: Scenario) -> Tensor:
         """Return the node displacements [1, L, C · V, 3] that a scenario variant causes."""
@@ -89,6 +86,11 @@ class Changes:
     finer: Tensor | None = None
     grip: tuple[Tensor, Tensor] | None = None
     """Linear and quadratic coefficient for a grasp that is g standard deviations larger."""
+
+    def at(self, chosen: Sequence[int]) -> Changes:
+        """Return the same for some frames, given by their positions."""
+        grip = None if self.grip is None else (self.grip[0][:, chosen], self.grip[1][:, chosen])
+        return Changes(None if self.finer is None else self.finer[:, chosen], grip)
 
 
 @dataclass(frozen=True)
