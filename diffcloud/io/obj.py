@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from diffcloud.errors import MeshError
-from diffcloud.io.files import write_text
-from diffcloud.io.inputs import read_text
+from diffcloud.io.files import write_bytes, write_text
+from diffcloud.io.inputs import read_input, read_text
 from diffcloud.io.numbers import number, whole
 from diffcloud.mesh.topology import ClothMesh, SurfaceMesh
 
@@ -134,6 +134,15 @@ def write_surface(path: Path, mesh: SurfaceMesh) -> None:
     lines = [f"v {x!r} {y!r} {z!r}" for x, y, z in mesh.nodes.tolist()]
     lines += ["f " + " ".join(str(node) for node in face) for face in (mesh.faces + 1).tolist()]
     write_text(path, "\n".join(lines) + "\n")
+
+
+def copy_mesh(path: Path, target: Path) -> None:
+    """Copy a mesh file.
+
+    Raises:
+        MeshError: the file cannot be read, or is too large.
+    """
+    write_bytes(target, read_input(path, kind="mesh", error=MeshError, most_bytes=_MOST_BYTES))
 
 
 def _parse(path: Path) -> _ObjFile:

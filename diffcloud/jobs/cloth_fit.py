@@ -26,6 +26,7 @@ from diffcloud.jobs.scene_files import read_fields
 from diffcloud.reporting.fit_page import Status, Told, page_of, summary_of
 from diffcloud.reporting.page import Summary
 from diffcloud.scene.scenarios import load_scenario
+from diffcloud.scene.scenarios.catalogue import paths_within, with_paths
 from diffcloud.sim import warm
 
 
@@ -61,7 +62,7 @@ class ClothFit:
         job, status = self.job, Status.finished
         job.task.check()  # before anything is written
         for name, fields in self.scenes.items():
-            write_text(self._scene(name), yaml.safe_dump(dict(fields), sort_keys=False))
+            self._write_scene(self._scene(name), fields)
         if seconds is not None:
             warm.implicit()  # compile first: this cannot be interrupted, and should not count as fit time
         record: FitRecord | None = None
@@ -94,6 +95,10 @@ class ClothFit:
         """Path of a scenario file while the fit is unfinished."""
         return self.out / "stages" / "scenes" / f"{name}.yaml"
 
+    def _write_scene(self, path: Path, fields: Mapping[str, Any]) -> None:
+        """Write a scenario file. Files in the folder of the fit have relative paths, so that the folder can be moved."""
+        _write_changed(path, yaml.safe_dump(paths_within(fields, path.parent, self.out), sort_keys=False).encode())
+
     def _intervals(self, record: FitRecord) -> Intervals | None:
         if record.estimate is None:
             return None
@@ -107,7 +112,7 @@ class ClothFit:
             return list(self.members)
         for name in self.scenes:
             path = self._scene(name)
-            write_text(path, yaml.safe_dump({**read_fields(path), **known_grip(found)}, sort_keys=False))
+            self._write_scene(path, {**with_paths(read_fields(path), path.parent), **known_grip(found)})
         return [
             replace(one, scenario=load_scenario(self._scene(one.scenario.name)))
             if one.scenario.name in self.scenes
@@ -121,9 +126,10 @@ class ClothFit:
         page = page_of(told, summary, {one.name: one.episode for one in self.members}, motions)
         with together():
             for path in files:
-                _copy(path, out / f"fit{path.suffix}")
+                _write_changed(out / f"fit{path.suffix}", path.read_bytes())
             for name in self.scenes:
-                _copy(self._scene(name), out / "scenes" / f"{name}.yaml")
+                fields = with_paths(read_fields(self._scene(name)), self._scene(name).parent)
+                self._write_scene(out / "scenes" / f"{name}.yaml", fields)
             write_text(out / "report.html", page)
             if told.intervals is not None:
                 write_json(out / "intervals.json", told.intervals.model_dump(mode="json"))
@@ -131,8 +137,7 @@ class ClothFit:
             (out / "intervals.json").unlink(missing_ok=True)
 
 
-def _copy(source: Path, target: Path) -> None:
-    """Copy a file, unless the target already has the same contents."""
-    content = source.read_bytes()
-    if not target.is_file() or target.read_bytes() != content:
-        write_bytes(target, content)
+def _write_changed(path: Path, content: bytes) -> None:
+    """Write a file, unless it already has the same contents."""
+    if not path.is_file() or path.read_bytes() != content:
+        write_bytes(path, content)

@@ -15,6 +15,7 @@ from diffcloud.errors import ConfigError
 from diffcloud.estimation.record import read_fit
 from diffcloud.io.files import files_in, together, write_text
 from diffcloud.io.timings import NAME
+from diffcloud.jobs.scene_files import MESH
 
 _PARAMS = """\
 # Settings for the stages of dvc.yaml. A stage runs again when its section or a file that it reads has changed.
@@ -64,11 +65,14 @@ def make_project(folder: Path, options: Sequence[str], params: Path | None = Non
         ConfigError: the folder already is a project, its fit is not finished, or DVC fails.
     """
     _check_finished(folder)
-    words, more = list(options), ""
+    words, more = list(options), [MESH] if (folder / MESH).is_file() else []
     if params is not None:
         file = os.path.relpath(params, folder)
-        words, more = [*words, "--params", file], f", {json.dumps(file)}"
-    pages = {"params.yaml": _PARAMS.format(options=json.dumps(shlex.join(words))), "dvc.yaml": _DVC.format(more=more)}
+        words, more = [*words, "--params", file], [*more, file]
+    pages = {
+        "params.yaml": _PARAMS.format(options=json.dumps(shlex.join(words))),
+        "dvc.yaml": _DVC.format(more="".join(f", {json.dumps(file)}" for file in more)),
+    }
     for name, text in pages.items():
         path = folder / name
         if path.exists() and path.read_text(encoding="utf-8") != text:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import filecmp
 from collections.abc import Collection, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -17,6 +19,7 @@ from diffcloud.io.files import files_in, read_json, read_yaml, together, write_j
 from diffcloud.io.fingerprints import fingerprint
 from diffcloud.io.grippers import tracks_beside
 from diffcloud.io.imports import cloud_folder
+from diffcloud.io.obj import copy_mesh
 from diffcloud.io.recordings import write_recording
 from diffcloud.io.ros.recording import ros_recording
 from diffcloud.jobs.preprocess import PreprocessJob
@@ -25,6 +28,8 @@ from diffcloud.jobs.settings import Config
 from diffcloud.scene.scenarios.catalogue import make_scenario, own_options, with_paths
 from diffcloud.scene.scenarios.layout import Found
 
+MESH = "cloth.obj"
+"""Copy of the mesh in the folder of a fit."""
 _BAGS = (".bag", ".mcap", ".db3")
 _HEAD = "# Found by diffcloud fit, with the reason beside each value. Edit and run the command again to overrule."
 
@@ -59,6 +64,8 @@ def find_scene(
         stated = read_fields(path).keys() if path.is_file() else set[str]()
         layouts = _layouts(out, episodes, names, cloth)
         _warn_of_changes(out, episodes, stated)
+    if _same(out / MESH, cloth.get("mesh")):
+        cloth = {**cloth, "mesh": str((out / MESH).resolve())}
     return episodes, cloth, layouts
 
 
@@ -179,17 +186,25 @@ def _cloth(
         _refuse_missing(missing_fields(fields), str(path))
         own_options(fields, "cloth", path, folder=out)
         fields = with_paths(fields, out)  # resolve the paths, because scenarios are written to another folder
-        for name, option, given in (
-            ("size_m", "--size", None if stated is None else list(stated)),
-            ("mesh", "--mesh", None if mesh is None else str(mesh.resolve())),
-        ):
-            if given is not None and given != fields.get(name):
-                told = "x".join(f"{side:g}" for side in given) if isinstance(given, list) else given
-                warn(f"{path} says {name} {fields.get(name)}, and that counts, not {option} {told}: edit the file.")
+        if stated is not None and list(stated) != fields.get("size_m"):
+            told = "x".join(f"{side:g}" for side in stated)
+            warn(f"{path} says size_m {fields.get('size_m')}, and that counts, not --size {told}: edit the file.")
+        if mesh is not None and not _same(mesh, fields.get("mesh")):
+            warn(f"{path} says mesh {fields.get('mesh')}, and that counts, not --mesh {mesh}: edit the file.")
         return fields
     found = found_cloth(list(episodes.values()), stated, mass, mesh)
+    fields = {name: entry.value for name, entry in found.items()}
+    if mesh is not None:  # a copy, so that the folder of the fit is complete
+        if not _same(mesh, str(out / MESH)):
+            copy_mesh(mesh, out / MESH)
+        found["mesh"] = replace(found["mesh"], value=MESH)
     write_text(path, _yaml(found))
-    return {name: entry.value for name, entry in found.items()}
+    return fields
+
+
+def _same(mesh: Path, other: object) -> bool:
+    """Return whether both are files with the same contents."""
+    return isinstance(other, str) and mesh.is_file() and Path(other).is_file() and filecmp.cmp(mesh, other, shallow=False)
 
 
 def _layouts(

@@ -590,6 +590,13 @@ class TestProject:
         assert [one.name for one in read_fit(project / "fit.json").episodes] == ["first"]
         assert "up to date" in dvc(project, "status", "fit")
 
+    def test_it_depends_on_the_mesh_of_the_cloth(self, project):
+        for page in ("params.yaml", "dvc.yaml"):
+            (project / page).unlink()
+        (project / "cloth.obj").write_text("v 0 0 0\n")
+        make_project(project, [])
+        assert "cloth.obj" in yaml.safe_load((project / "dvc.yaml").read_text())["stages"]["fit"]["deps"]
+
     def test_what_was_typed_is_kept(self, project):
         """But the recordings and what was found in them. A path is relative to the project."""
         (project.parent / "my settings.yaml").write_text("fit: {seed: 3}\n")

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import yaml
 
 from diffcloud.errors import ConfigError, EpisodeError
 from diffcloud.identification import found_cloth, found_layout
-from diffcloud.io.episodes import Episode
+from diffcloud.io.episodes import Episode, write_episode
 from diffcloud.io.obj import write_surface
+from diffcloud.jobs.scene_files import find_scene
 from diffcloud.mesh.shapes import grid_cloth
 from diffcloud.mesh.topology import SurfaceMesh
-from diffcloud.scene.scenarios.catalogue import make_scenario, own_options
+from diffcloud.scene.scenarios import load_scenario
+from diffcloud.scene.scenarios.catalogue import make_scenario, own_options, paths_within, with_paths
 from diffcloud.scene.scenarios.layout import find_layout
 from diffcloud.scene.scenarios.surface import flat_points, level_frame
 from tests.cli.invoke import invoke
@@ -117,3 +120,34 @@ def test_the_command_takes_tracks_of_two_grippers(tmp_path):
     np.save(folder / "001.npy", np.zeros((5, 3)))
     (folder / "gripper_b.csv").write_text("t_s,x,y,z\n0,0,0,0\n.1,0,0,0\n")
     assert "gripper 'a' has 1 rows for 2 clouds" in invoke(*command, code=1).errors.replace("\n", " ")
+
+
+def test_the_folder_of_a_fit_has_its_own_mesh_and_can_be_moved(tmp_path, capsys):
+    episode, _ = recorded()
+    write_episode(tmp_path / "lifted.npz", episode)
+    write_surface(tmp_path / "shirt.obj", MESH)
+    here, there = tmp_path / "found", tmp_path / "elsewhere"
+    mesh, recordings = tmp_path / "shirt.obj", [tmp_path / "lifted.npz"]
+    _, cloth, layouts = find_scene(recordings, here, None, 0.2, mesh=mesh)
+    assert yaml.safe_load((here / "cloth.yaml").read_text())["mesh"] == "cloth.obj"
+    assert (here / "cloth.obj").read_bytes() == mesh.read_bytes()
+    fields = {**cloth, **layouts["lifted"]}
+    (here / "scenes").mkdir()
+    (here / "scenes/lifted.yaml").write_text(yaml.safe_dump(paths_within(fields, here / "scenes", here)))
+    here.rename(there)
+    mesh.unlink()
+    moved = load_scenario(there / "scenes/lifted.yaml")
+    assert len(moved.scene.mesh.nodes) > 100
+    find_scene(recordings, there, None, 0.2, mesh=there / "cloth.obj")
+    assert "that counts" not in capsys.readouterr().err
+    write_surface(mesh, SurfaceMesh(2 * MESH.nodes, MESH.faces))
+    find_scene(recordings, there, None, 0.2, mesh=mesh)
+    assert "that counts, not --mesh" in capsys.readouterr().err.replace("\n", " ")
+
+
+def test_paths_outside_of_the_folder_stay_absolute(tmp_path):
+    fields = {"mesh": str(tmp_path / "a/b/cloth.obj"), "material": str(tmp_path / "own.json"), "base": "mesh"}
+    told = paths_within(fields, tmp_path / "a/scenes", tmp_path / "a")
+    assert told == {"mesh": "../b/cloth.obj", "material": str(tmp_path / "own.json"), "base": "mesh"}
+    assert with_paths(told, tmp_path / "a/scenes") == fields
+    assert paths_within({"material": "knit"}, tmp_path, tmp_path) == {"material": "knit"}

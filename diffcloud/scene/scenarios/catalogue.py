@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Literal, overload
@@ -128,6 +129,19 @@ def with_paths(fields: Mapping[str, object], folder: Path) -> dict[str, object]:
         name: value for name, value in fields.items() if isinstance(value, str) and value.endswith(_FILES.get(name, ()))
     }
     return {**fields, **{name: str((folder / value).resolve()) for name, value in files.items()}}
+
+
+def paths_within(fields: Mapping[str, object], folder: Path, whole: Path) -> dict[str, object]:
+    """Return the fields of a scenario file with paths relative to its folder, for files within a larger folder.
+
+    Args:
+        fields: fields with absolute paths, as `with_paths` returns them.
+        folder: folder of the scenario file.
+        whole: folder that may be moved together with its files.
+    """
+    files = {name: Path(value) for name in _FILES if isinstance(value := fields.get(name), str)}
+    inside = {name: path for name, path in files.items() if path.is_relative_to(whole.resolve())}
+    return {**fields, **{name: os.path.relpath(path, folder.resolve()) for name, path in inside.items()}}
 
 
 def own_options(fields: Mapping[str, object], name: str, source: object, *, folder: Path) -> Options:
