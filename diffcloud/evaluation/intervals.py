@@ -37,6 +37,7 @@ ParameterStatus = Literal[
     "ratio_only",
     "combination_only",
     "prior_dominated",
+    "mesh_dependent",
     "not_identified",
     "model_error",
 ]
@@ -120,11 +121,14 @@ class Intervals(_Model):
     """Why the intervals may still be wrong; else empty."""
     note: str = ""
     """Why the ratio is not an exact invariant if the density acts on a part of the cloth; else empty."""
+    mesh_note: str = ""
+    """Why the bending stiffness depends on the mesh; else empty."""
 
     @property
     def sentences(self) -> list[str]:
-        """Reason, warning and note as sentences."""
-        return [text[0].upper() + text[1:] + "." for text in (self.reason, self.warning, self.note) if text]
+        """Reason, warning and notes as sentences."""
+        texts = (self.reason, self.warning, self.note, self.mesh_note)
+        return [text[0].upper() + text[1:] + "." for text in texts if text]
 
 
 @dataclass(frozen=True)
@@ -170,6 +174,7 @@ def intervals_of(
     ratio = None if ratio_row is None else _ratio(values, found.reach(ratio_row), scenario)
     combinations = _combinations(found, space)
     fits_to_noise, reason = _followed(record)
+    mesh_note = _mesh_note(record, values, scenario) if fits_to_noise and "bending" in space.names else ""
     parameters = {}
     for index, variable in enumerate(space.variables):
         name = variable.name
@@ -181,6 +186,8 @@ def intervals_of(
             status = "model_error"
         elif prior is not None and prior[index, index] > _PRIOR * found.covariance[index, index]:
             status = "prior_dominated"
+        elif name == "bending" and mesh_note:
+            status = "mesh_dependent"
         elif factor <= within and not bounded:
             status = "identified"
         elif name in ("stretching", "density") and ratio is not None and ratio.factor <= within:
@@ -214,6 +221,7 @@ def intervals_of(
         reason=reason,
         warning=_UNFINISHED if fits_to_noise and record.stop_reason == "iterations" else "",
         note="" if ratio is None else _node_set_note(scenario),
+        mesh_note=mesh_note,
     )
 
 
@@ -312,6 +320,27 @@ def _node_set_note(scenario: Scenario) -> str:
     if nodes is None:
         return ""
     return f"density multiplies {len(nodes)} of {len(scenario.scene.mesh.nodes)} nodes, so their ratio is no exact scale"
+
+
+def _mesh_note(record: FitRecord, values: Mapping[str, float], scenario: Scenario) -> str:
+    """Return `Intervals.mesh_note`. Recordings that this simulator made on the same mesh need none.
+
+    A cloth folds under its weight with radii of about its bending length, (B / (ρ g))^(1/3) (Peirce, The "handle" of cloth
+    as a measurable quantity, J. Textile Institute 1930). Longer edges cannot bend like that, and act stiffer.
+    """
+    assert record.estimate is not None
+    gravity = float(np.linalg.norm(scenario.scene.surrounding.gravity)) * scenario.length_unit_m
+    if gravity == 0 or not np.any(record.estimate.sources.get("mesh", 0.0)):
+        return ""
+    density = record.parameters["density"].value if "density" in record.parameters else scenario.nominal("density")
+    folds = (values["bending"] * scenario.nominal("bending") / (density * gravity)) ** (1 / 3)
+    edges = math.sqrt(2 * float(scenario.scene.mesh.face_area.mean())) * scenario.length_unit_m
+    if folds >= edges:
+        return ""
+    return (
+        f"the bending stiffness holds for this mesh only: its edges are {1e3 * edges:.0f} mm long, and the bending length "
+        f"of the cloth is {1e3 * folds:.0f} mm"
+    )
 
 
 def _ends(space: FitSpace, index: int, value: float, reach: float) -> tuple[float, float, list[float]]:

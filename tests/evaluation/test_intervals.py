@@ -156,3 +156,34 @@ def test_a_note_where_mass_multiplies_a_part_of_the_cloth():
     assert told(sources).sentences == []
     (sentence,) = told(sources, scenario=replace(SCENARIO, node_sets={"density": np.arange(5)})).sentences
     assert f"5 of {len(SCENARIO.scene.mesh.nodes)} nodes" in sentence
+
+
+class TestBendingOnACoarseMesh:
+    """The cloth of the scenario has edges of 66 mm and a bending length of 13 mm."""
+
+    SPACE = FitSpace.build(["bending"], bounds={"bending": (0.01, 1e4)})
+
+    def of(self, mesh, bending):
+        sources = {"recording": [[0.01]], "mesh": [[mesh]]}
+        return told(sources, space=self.SPACE, values={"bending": bending})
+
+    def test_it_depends_on_the_mesh(self):
+        found = self.of(0.001, 1.0)
+        assert found.parameters["bending"].status == "mesh_dependent"
+        mesh, nominal = SCENARIO.scene.mesh, {name: SCENARIO.nominal(name) for name in ("bending", "density")}
+        edge = float(np.linalg.norm(mesh.nodes[1] - mesh.nodes[0]))
+        length = (nominal["bending"] / (nominal["density"] * 9.81)) ** (1 / 3)
+        assert f"edges are {1e3 * edge:.0f} mm long" in found.sentences[-1]
+        assert f"cloth is {1e3 * length:.0f} mm" in found.sentences[-1]
+
+    def test_a_stiff_cloth_bends_with_the_mesh(self):
+        mesh, density = SCENARIO.scene.mesh, SCENARIO.nominal("density")
+        edge = float(np.linalg.norm(mesh.nodes[1] - mesh.nodes[0]))
+        enough = edge**3 * density * 9.81 / SCENARIO.nominal("bending")
+        assert self.of(0.001, 0.99 * enough).parameters["bending"].status == "mesh_dependent"
+        assert self.of(0.001, 1.01 * enough).parameters["bending"].status == "identified"
+
+    def test_a_motion_of_the_same_mesh_has_no_error_of_it(self):
+        found = self.of(0.0, 1.0)
+        assert found.parameters["bending"].status == "identified"
+        assert found.sentences == []
