@@ -426,7 +426,7 @@ class Case:
     truth: float
     """Stretching of a strip [N/m]"""
     stated: bool
-    """Whether there is an interval."""
+    """Whether there is a valid interval."""
     value: float
     low: float
     high: float
@@ -488,12 +488,12 @@ def fitted(one: Set, seed: int, out: Path, revision: str) -> Case:
         return Case(one.name, seed, truth, False, 1.0, 1.0, 1.0, False, "failed", seconds, " ".join(said), revision)
     told = json.loads((folder / "result.json").read_text())
     found = told["parameters"]["stretching"]
-    stated = found["low"] is not None
+    stated = found["low"] is not None and found["status"] != "model_error"
     low, high = (found["low"], found["high"]) if stated else (found["value"], found["value"])
     upper = stated and high >= _upper(folder / "found")
     bent = told["parameters"]["bending"]
     bending = None
-    if one.simulator != "newton" and bent["low"] is not None:
+    if stated and one.simulator != "newton" and bent["low"] is not None:
         bending = (cloths[0].sheet.bending, bent["low"], bent["high"])
     return Case(
         one.name,
@@ -662,9 +662,8 @@ def _page(cases: Sequence[Case], seed: int, count: int, revision: str) -> str:
         note=f"Random cloths of {COLUMNS} × {ROWS} nodes are moved by MuJoCo or Newton, without air, and seen by depth "
         f"cameras with {1e3 * _NOISE:.0f} mm of noise. `diffcloud fit` estimates the stretching stiffness with known "
         "density and unknown friction and bending. *Bending held* counts intervals of bending, all other columns are "
-        "about stretching. Odd seeds have wide ranges of material: 3 to 2,000 N/m. *Held* "
-        "counts intervals that contain the true value; a fit without an interval counts as not held. Errors are "
-        "logarithms, half-widths are "
+        "about stretching. Odd seeds have wide ranges of material: 3 to 2,000 N/m. *Held* counts intervals that contain "
+        "the true value; a fit without one, or with a model error, counts as not held. Errors are logarithms, half-widths are "
         "factors.\n\n" + "\n".join(f"- *{one.name}*: {one.about}." for one in sets),
         made=f"{datetime.now(UTC).date()} at commit {revision[:12]}",
         command=f"python -m studies foreign --sets {','.join(one.name for one in sets)} --seed {seed} --count {count}",

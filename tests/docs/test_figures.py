@@ -51,17 +51,16 @@ FIGURES = [
     ),
     Figure(
         "README.md",
-        r"towels, (?P<a>\d+ of \d+), (?P<b>\d+ of \d+) and (?P<c>\d+ of \d+) intervals .* takes (?P<seconds>\d+) s ",
+        r"on new towels, (?P<held>\d+ of \d+) intervals .* takes (?P<seconds>\d+) s ",
         FOREIGN,
-        r"\| towels \| (?P<a>\d+ of \d+) \|(?s:.*?)\| 381852, .*\| towels \| (?P<b>\d+ of \d+) \|(?s:.*?)\| 412337, .*"
-        r"\| towels \| (?P<c>\d+ of \d+) \|.* (?P<seconds>\d+) \|\n",
+        r"\| towels \| (?P<held>\d+ of \d+) \|.* (?P<seconds>\d+) \|\n",
     ),
     coverage(r"size and position of the cloth known", "towels"),
     coverage(r"pad stated 1\.5 times wrong", "untold"),
-    coverage(r"two lifts, fitted jointly", "joint: two lifts of each towel"),
-    coverage(r"one lift in Newton", "newton"),
-    coverage(r"one lift, seen by one camera", r"64ab158fe303, (?s:.*?)\| one camera"),
-    coverage(r"points near the table cut", r"64ab158fe303, (?s:.*?)\| cut 5 mm above the table"),
+    coverage(r"two lifts, fitted jointly", "joint"),
+    coverage(r"one lift in Newton, an earlier version of the fit", "newton"),
+    coverage(r"one lift, seen by one camera", "one_camera"),
+    coverage(r"points near the table cut", "cut"),
     coverage(r"one fold", "folds"),
     Figure(
         "README.md", r"pad stated (?P<factor>[\d.]+) times wrong", FOREIGN, r"stated (?P<factor>[\d.]+) times too large"
