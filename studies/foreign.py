@@ -663,8 +663,8 @@ def _page(cases: Sequence[Case], seed: int, count: int, revision: str) -> str:
         f"cameras with {1e3 * _NOISE:.0f} mm of noise. `diffcloud fit` estimates the stretching stiffness with known "
         "density and unknown friction and bending. *Bending held* counts intervals of bending, all other columns are "
         "about stretching. Odd seeds have wide ranges of material: 3 to 2,000 N/m. *Held* counts intervals that contain "
-        "the true value; a fit without one, or with a model error, counts as not held. Errors are logarithms, half-widths are "
-        "factors.\n\n" + "\n".join(f"- *{one.name}*: {one.about}." for one in sets),
+        "the true value; a fit without one, or with a model error, counts as not held. Errors are logarithms, half-widths "
+        "are factors.\n\n" + "\n".join(f"- *{one.name}*: {one.about}." for one in sets),
         made=f"{datetime.now(UTC).date()} at commit {revision[:12]}",
         command=f"python -m studies foreign --sets {','.join(one.name for one in sets)} --seed {seed} --count {count}",
         details={
