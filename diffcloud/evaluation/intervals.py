@@ -325,7 +325,7 @@ def _node_set_note(scenario: Scenario) -> str:
 def _mesh_note(record: FitRecord, values: Mapping[str, float], scenario: Scenario) -> str:
     """Return `Intervals.mesh_note`. Recordings that this simulator made on the same mesh need none.
 
-    A cloth folds under its weight with radii of about its bending length, (B / (ρ g))^(1/3) (Peirce, The "handle" of cloth
+    Under its weight, a cloth folds with radii of about its bending length, (B / (ρ g))^(1/3) (Peirce, The "handle" of cloth
     as a measurable quantity, J. Textile Institute 1930). Longer edges cannot bend like that, and act stiffer.
     """
     assert record.estimate is not None
@@ -339,7 +339,7 @@ def _mesh_note(record: FitRecord, values: Mapping[str, float], scenario: Scenari
         return ""
     return (
         f"the bending stiffness holds for this mesh only: its edges are {1e3 * edges:.0f} mm long, and the bending length "
-        f"of the cloth is {1e3 * folds:.0f} mm"
+        f"of the cloth is {1e3 * folds:.0f} mm; use more nodes"
     )
 
 

@@ -167,8 +167,8 @@ def _next_steps(told: Told) -> list[str]:
             "Look at the recordings and the fit with diffcloud view: does the cloth start where the clouds show it?"
         )
     if found is not None and usable:
-        open_to = ("identified", "mesh_dependent")  # a finding says what the latter means
-        statuses = {name: one.status for name, one in found.parameters.items() if one.status not in open_to}
+        explained = ("identified", "mesh_dependent")  # of the latter, the findings say what to do
+        statuses = {name: one.status for name, one in found.parameters.items() if one.status not in explained}
         if "density" in statuses:
             steps.append("Weigh the cloth, divide by its area and pass --density. Stretching is then known apart from it.")
         for name in statuses if "density" not in statuses else ():

@@ -18,7 +18,7 @@ that this simulator made on the same mesh need no correction. For them the horiz
 best result is refined on all frames if possible.
 
 The simulation may depart from the recording earlier, for example because its contact is wrong. If c of the best result
-exceeds 1.5 in a frame, the descents continue without that frame and the later ones.
+exceeds 1.5 in a frame, the descents continue without that frame and the later ones. This is checked after each start.
 
 The variables are those of the space, the pose of each recording, and the size of the grasp if it is unknown. The effect
 of the grasp size is interpolated between three sizes, which are centred on the result of the first start. Gauss–Newton

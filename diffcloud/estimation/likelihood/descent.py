@@ -12,7 +12,7 @@ from torch import Tensor
 from diffcloud.errors import DivergedError
 from diffcloud.estimation.bounded import lowest_within
 from diffcloud.estimation.initial_state import asked_as
-from diffcloud.estimation.likelihood.energy import Likelihood, Look, Terms
+from diffcloud.estimation.likelihood.energy import Correction, Likelihood, Terms
 from diffcloud.estimation.likelihood.frames import squared
 from diffcloud.estimation.likelihood.grasp import in_powers
 from diffcloud.estimation.likelihood.recording import Changes, Linear
@@ -29,8 +29,8 @@ _RISE = 0.02
 """Allowed increase of Φ in a step, per independent residual."""
 _BACKTRACKS = 3
 _NEAR = 0.5
-"""The refined mesh is simulated where the next step is smaller than this, in standard deviations, unless that was done at
-a point as near."""
+"""Where the next step is smaller than this, in standard deviations, the refined mesh is simulated. If that was done at a
+point within this distance, its result is used again."""
 _NARROW = 0.05
 """Smallest bound on a step after divergence or an increase of Φ."""
 _GAINS, _BEHIND = 3.0, 20.0
@@ -84,7 +84,7 @@ class Descent:
         """
         self.of, self.place, self._tell = likelihood, place, tell
         self.reached: Reached | None = None
-        self._look: Look | None = None
+        self._correction: Correction | None = None
         self._trace: list[tuple[float, Tensor]] = []
 
     def run(self, to_beat: float) -> Answer | None:
@@ -104,8 +104,8 @@ class Descent:
                     raise
                 place, radius = 0.5 * (place + best.place), max(0.5 * radius, _NARROW)
                 continue
-            if self._look is None:
-                self._look = of.nearest(place) or self._simulated(linear, place)
+            if self._correction is None:
+                self._correction = of.nearest(place) or self._corrected(linear, place)
             terms = self._terms(linear, place)
             if best is not None and terms.energy > best.energy + allowed:
                 tried += 1
@@ -116,10 +116,10 @@ class Descent:
             tried = 0
             step = self._step(terms, place, radius)
             within = (_NEAR * terms.deviations).clamp(max=radius)
-            if bool((step.abs() < within)[of.asked].all()) and self._look.distance(place, terms.deviations) > _NEAR:
+            if bool((step.abs() < within)[of.asked].all()) and self._correction.distance(place, terms.deviations) > _NEAR:
                 near = of.nearest(place, terms.deviations)
                 known = near is not None and near.distance(place, terms.deviations) <= _NEAR
-                self._look = near if known else self._simulated(linear, place)
+                self._correction = near if known else self._corrected(linear, place)
                 terms = self._terms(linear, place)
                 step = self._step(terms, place, radius)
             self.reached = Reached(place, linear, terms)
@@ -143,17 +143,19 @@ class Descent:
         self.of.simulations += len(self.of.recordings)
         return map_threads(lambda one: Linear.at(one, place), self.of.recordings)
 
-    def _simulated(self, linear: Sequence[Linear], place: Tensor) -> Look:
+    def _corrected(self, linear: Sequence[Linear], place: Tensor) -> Correction:
         """Simulate the refined mesh and the other grasp sizes at this point."""
 
-        def look(one: Linear, old: Changes) -> Changes:
+        def changes(one: Linear, old: Changes) -> Changes:
             finer = self._refined(one, place) if one.recording.model_error else None
             grips = [self._changed(one, place, other) for other in one.recording.regripped]
             return Changes(old.finer if finer is None else finer, in_powers(grips) or old.grip)
 
-        before = self._look.changes if self._look else [Changes()] * len(linear)
-        found = Look(place, self.of.asked, map_threads(lambda pair: look(*pair), [*zip(linear, before, strict=True)]))
-        self.of.looks.append(found)
+        before = self._correction.changes if self._correction else [Changes()] * len(linear)
+        found = Correction(
+            place, self.of.asked, map_threads(lambda pair: changes(*pair), [*zip(linear, before, strict=True)])
+        )
+        self.of.corrections.append(found)
         return found
 
     def _refined(self, one: Linear, place: Tensor) -> Tensor | None:
@@ -170,11 +172,11 @@ class Descent:
             return None
 
     def _terms(self, linear: Sequence[Linear], place: Tensor) -> Terms:
-        assert self._look is not None
+        assert self._correction is not None
         of, squares = self.of, list[float]()
         off = of.off_centre(place)
         energy, slope, matrix = float((of.precision * off.square()).sum()), of.precision * off, torch.diag(of.precision)
-        for one, changes in zip(linear, self._look.changes, strict=True):
+        for one, changes in zip(linear, self._correction.changes, strict=True):
             frames, n, columns = one.frames(place, changes), one.recording.independent, one.recording.columns
             energy += n * frames.energy()
             weights = n * frames.weights
@@ -186,7 +188,7 @@ class Descent:
     def answer(self, *, converged: bool) -> Answer:
         """Return the result at the last accepted iterate."""
         assert self.reached is not None
-        assert self._look is not None
+        assert self._correction is not None
         place, terms, of = self.reached.place, self.reached.terms, self.of
         covariance = terms.covariance
         precision = torch.diag(of.precision)
@@ -201,7 +203,7 @@ class Descent:
             sources["grasp"] = torch.outer(covariance[-1], covariance[-1])
         sources |= {name: torch.zeros_like(covariance) for name in ("mesh", "time step")}
         chi_squares, apart = [], []
-        for one, known in zip(self.reached.linear, self._look.changes, strict=True):
+        for one, known in zip(self.reached.linear, self._correction.changes, strict=True):
             recording, shift = one.recording, known.finer
             changes = dict[str, Tensor | None]()
             if recording.model_error:

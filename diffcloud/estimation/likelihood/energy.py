@@ -41,23 +41,23 @@ _EDGE = 1e-6
 
 
 @dataclass(frozen=True)
-class Look:
-    """What scenario variants change at one point."""
+class Correction:
+    """Effect of the refined mesh and of other grasp sizes on the motion, simulated at one point."""
 
     place: Tensor
     """[K] coordinates."""
     asked: Tensor
     """Indices of the requested variables."""
     changes: Sequence[Changes]
-    """Of each recording."""
+    """Node displacements of each recording."""
 
     def distance(self, place: Tensor, deviations: Tensor | float) -> float:
-        """Return the largest distance of a requested variable from a point, in these deviations."""
+        """Return the largest distance from a point among the requested variables, divided by these deviations."""
         return float(((place - self.place) / deviations)[self.asked].abs().max())
 
-    def at(self, chosen: Sequence[Sequence[int]]) -> Look:
-        """Return the same for some frames of each recording."""
-        return Look(self.place, self.asked, [one.at(own) for one, own in zip(self.changes, chosen, strict=True)])
+    def at(self, chosen: Sequence[Sequence[int]]) -> Correction:
+        """Return the correction for a subset of the frames of each recording."""
+        return Correction(self.place, self.asked, [one.at(own) for one, own in zip(self.changes, chosen, strict=True)])
 
 
 class Likelihood:
@@ -81,7 +81,7 @@ class Likelihood:
             count += len(objective.pose_space.names)
         asked = [index for index, one in enumerate(space.variables) if not one.nuisance]
         self.asked = torch.tensor(asked, dtype=torch.long)
-        self.looks = list[Look]()
+        self.corrections = list[Correction]()
         self.knows_grip = not any(one.regripped for one in self.recordings)
         self.poses = count - variables
         steps, poses = space.prior_steps(), torch.ones(self.poses + (not self.knows_grip), dtype=torch.float64)
@@ -135,12 +135,12 @@ class Likelihood:
         for one, whole in zip(found.recordings, self.recordings, strict=True):
             chosen.append([whole.objective.frames.index(frame) for frame in one.objective.frames])
             one.refined = whole.refined_in(chosen[-1])
-        found.looks = [look.at(chosen) for look in self.looks]
+        found.corrections = [one.at(chosen) for one in self.corrections]
         return found
 
-    def nearest(self, place: Tensor, deviations: Tensor | float = 1.0) -> Look | None:
-        """Return the look nearest to a point, in these deviations; None if there is none."""
-        return min(self.looks, key=lambda one: one.distance(place, deviations), default=None)
+    def nearest(self, place: Tensor, deviations: Tensor | float = 1.0) -> Correction | None:
+        """Return the correction nearest to a point, with distances in these deviations; None if there is none."""
+        return min(self.corrections, key=lambda one: one.distance(place, deviations), default=None)
 
     def start(self, init: Mapping[str, float], offset: float) -> Tensor:
         """Return start coordinates [K] from these values, or else from the centres of the priors.

@@ -71,7 +71,7 @@ class Recording:
         return self.objective.scenario.finer()
 
     def refined_in(self, chosen: Sequence[int]) -> tuple[Tensor, Tensor] | None:
-        """Return `refined` for some frames, given by their positions."""
+        """Return `refined` for the frames with these indices."""
         return None if self.refined is None else (self.refined[0], self.refined[1][:, chosen])
 
     def change(self, place: Tensor, nodes: Tensor, variant: Scenario) -> Tensor:
@@ -88,7 +88,7 @@ class Changes:
     """Linear and quadratic coefficient for a grasp that is g standard deviations larger."""
 
     def at(self, chosen: Sequence[int]) -> Changes:
-        """Return the same for some frames, given by their positions."""
+        """Return the changes for the frames with these indices."""
         grip = None if self.grip is None else (self.grip[0][:, chosen], self.grip[1][:, chosen])
         return Changes(None if self.finer is None else self.finer[:, chosen], grip)
 
