@@ -13,6 +13,7 @@ import torch
 from diffcloud.errors import DivergedError
 from diffcloud.estimation.joint import JointObjective
 from diffcloud.estimation.likelihood import Answer, Estimate, LikelihoodSettings, energy
+from diffcloud.estimation.likelihood.descent import Descent
 from diffcloud.estimation.likelihood.energy import Likelihood, up_to_horizon
 from diffcloud.estimation.likelihood.estimate import places_beside
 from diffcloud.estimation.likelihood.frames import Frames
@@ -244,6 +245,33 @@ class TestMixture:
         found = Estimate(FitSpace((SPACE.variables[0],), {}), self.answers(0.0, 40.0), (), (), None, 2)
         assert float(found.mean) < 1e-8
         assert float(found.covariance) == pytest.approx(0.5, abs=1e-7)
+
+
+class TestCorrections:
+    def descended(self, likelihood, place):
+        return Descent(likelihood, place, lambda *progress: None).run(math.inf)
+
+    def test_one_serves_all_descents_that_end_near_it(self, found):
+        """And fewer frames of the same recording."""
+        likelihood = Likelihood(found.estimate.members, SPACE, LikelihoodSettings())
+        first = self.descended(likelihood, found.estimate.best.place)
+        count, known = len(likelihood.corrections), likelihood.nearest(first.place)
+        assert known.distance(first.place, first.covariance.diagonal().sqrt()) < 0.5
+        self.descended(likelihood, first.place)
+        assert len(likelihood.corrections) == count
+        shorter = likelihood.earliest([7])
+        (changes,), (recording,) = shorter.nearest(first.place).changes, shorter.recordings
+        again = recording.change(known.place, recording.nodes(known.place), recording.finer)
+        torch.testing.assert_close(changes.finer, again, rtol=0.0, atol=1e-12)
+
+    def test_elsewhere_it_is_simulated_again(self, found):
+        likelihood = Likelihood(found.estimate.members, SPACE, LikelihoodSettings())
+        self.descended(likelihood, likelihood.start({}, 2.0))
+        places = [one.place for one in likelihood.corrections]
+        assert len(places) > 1
+        assert likelihood.nearest(places[-1]) is likelihood.corrections[-1]
+        deviations = found.estimate.best.covariance.diagonal().sqrt()
+        assert likelihood.corrections[0].distance(places[-1], deviations) > 0.5
 
 
 class TestStartsBesideAResult:
