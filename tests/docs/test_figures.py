@@ -66,6 +66,12 @@ FIGURES = [
         "README.md", r"pad stated (?P<factor>[\d.]+) times wrong", FOREIGN, r"stated (?P<factor>[\d.]+) times too large"
     ),
     Figure(
+        "docs/limits.md",
+        r"(?P<held>\d+ of \d+) bending intervals .* is (?P<times>[\d.]+) times too large",
+        FOREIGN,
+        r"\| towels \|(?:[^|]*\|){5} (?P<held>\d+ of \d+) \|(?s:.*) overestimated: (?P<times>[\d.]+) times",
+    ),
+    Figure(
         "docs/concepts.md",
         r"converge from a yaw error of (?P<yaw>\d+)°",
         MOVED,
