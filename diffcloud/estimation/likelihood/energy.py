@@ -53,7 +53,8 @@ class Correction:
 
     def distance(self, place: Tensor, deviations: Tensor | float) -> float:
         """Return the largest distance from a point among the requested variables, divided by these deviations."""
-        return float(((place - self.place) / deviations)[self.asked].abs().max())
+        away = ((place - self.place) / deviations)[self.asked].abs()
+        return float(away.max()) if len(away) else 0.0
 
     def at(self, chosen: Sequence[Sequence[int]]) -> Correction:
         """Return the correction for a subset of the frames of each recording."""
