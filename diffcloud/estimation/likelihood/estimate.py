@@ -133,7 +133,7 @@ class _Search:
         self._simulated = list[Likelihood]()
         self.likelihood = self._counted(up_to_horizon(members, space, settings))
         self.horizon = self.likelihood
-        """Likelihood of the frames before the motions of both meshes differ. That of `likelihood` may have fewer."""
+        """Likelihood of all frames up to the horizon. `likelihood` has fewer after a departure."""
 
     @property
     def best(self) -> Answer:
@@ -225,7 +225,7 @@ class _Search:
             self.likelihood, self.answers = whole, [found]
 
     def _counted(self, likelihood: Likelihood) -> Likelihood:
-        """Count the simulations of a likelihood."""
+        """Include a likelihood in the count of simulations, and return it."""
         self._simulated.append(likelihood)
         return likelihood
 
@@ -233,7 +233,7 @@ class _Search:
         """Return the result of a descent; None if it diverges or is abandoned.
 
         Args:
-            to_beat: Φ above which it is abandoned. Default: that of the best result.
+            to_beat: as of `Descent.run`. Default: Φ of the best result so far.
         """
         if to_beat is None:
             to_beat = self.best.energy if self.answers else math.inf
