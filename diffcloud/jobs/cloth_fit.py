@@ -96,7 +96,7 @@ class ClothFit:
         return self.out / "stages" / "scenes" / f"{name}.yaml"
 
     def _write_scene(self, path: Path, fields: Mapping[str, Any]) -> None:
-        """Write a scenario file. Files in the folder of the fit have relative paths, so that the folder can be moved."""
+        """Write a scenario file. Paths within the folder of the fit are relative, so that the folder can be moved."""
         _write_changed(path, yaml.safe_dump(paths_within(fields, path.parent, self.out), sort_keys=False).encode())
 
     def _intervals(self, record: FitRecord) -> Intervals | None:

@@ -132,7 +132,7 @@ def with_paths(fields: Mapping[str, object], folder: Path) -> dict[str, object]:
 
 
 def paths_within(fields: Mapping[str, object], folder: Path, whole: Path) -> dict[str, object]:
-    """Return the fields of a scenario file with paths relative to its folder, for files within a larger folder.
+    """Return the fields of a scenario file. Paths of files within `whole` become relative to its folder.
 
     Args:
         fields: fields with absolute paths, as `with_paths` returns them.
