@@ -107,7 +107,7 @@ def time_matching(scenario: Scenario, points: int, *, repeats: int = 5) -> Match
 
     def once(known: tuple[Tensor, Tensor] | tuple[None, None], shift: float) -> tuple[float, tuple[Tensor, Tensor]]:
         begin = time.perf_counter()
-        _, forth = pairs_forth(places, [moved + shift], [clouds], cut=None, share=0.5, guesses=known[0])
+        _, forth = pairs_forth(places, [moved + shift], [clouds], crop=None, share=0.5, guesses=known[0])
         _, back = nearest_places(nodes[1:], faces, queries - shift, known[1])
         return time.perf_counter() - begin, (forth, back)
 

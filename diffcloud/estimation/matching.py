@@ -33,7 +33,7 @@ from diffcloud.clouds.neighbours import NeighbourIndex
 from diffcloud.clouds.sampling import SurfacePoints
 from diffcloud.clouds.visibility import seen_places
 from diffcloud.estimation.pose import PoseSpace
-from diffcloud.estimation.targets import Target
+from diffcloud.estimation.targets import Crop, Target
 
 
 @dataclass(frozen=True)
@@ -210,7 +210,7 @@ class Matcher:
         share, seen = 1.0 if self._recorded is None else 0.5, self._of(self._seen, entries)
         last = [self._of(found, entries) for found in self._found]
         forth, found = pairs_forth(
-            places, moved, target.views, nodes=views[0].shape[-2], cut=target.cut, share=share, seen=seen, guesses=last[0]
+            places, moved, target.views, nodes=views[0].shape[-2], crop=target.crop, share=share, seen=seen, guesses=last[0]
         )
         self._keep(0, found, entries)
         pairs = [forth]
@@ -276,7 +276,7 @@ def pairs_forth(
     clouds: Sequence[Sequence[NeighbourIndex]],
     *,
     nodes: int = 0,
-    cut: float | None,
+    crop: Crop | None,
     share: float,
     seen: Tensor | None = None,
     guesses: Tensor | None = None,
@@ -287,7 +287,7 @@ def pairs_forth(
         moved: [C] their positions [B, L, N, 3] in the recording's frame at the time of each clock.
         clouds: [C][L] recorded points of each clock.
         nodes: number of nodes per clock; the node indices of later clocks are offset by multiples of it.
-        cut: surface points below this height are excluded, because the recording was cropped there.
+        crop: crop of the recording, which gives the weights of surface points.
         share: sum of the weights over all frames.
         seen: bool [B, L, N] visible points; None for all.
         guesses: [B, L, N, C] indices of points that are probably near; they only save time.
@@ -315,10 +315,10 @@ def pairs_forth(
         )
         own_nodes = places.nodes % nodes + clock * nodes
         places = SurfacePoints(torch.where(which, own_nodes, places.nodes), places.barycentric)
-    counted = torch.ones_like(here[..., 0]) if cut is None else (here[..., 2] >= cut).to(here)
+    counted = torch.ones_like(here[..., 0]) if crop is None else crop.weights(here[..., 2])
     if seen is not None:
         counted = counted * seen
-    weights = share / frames * counted / counted.sum(-1, keepdim=True).clamp(min=1.0)
+    weights = share / frames * counted / counted.sum(-1, keepdim=True).clamp(min=torch.finfo(counted.dtype).tiny)
     spacing = here.new_tensor([max(cloud.spacing for cloud in of_frame) for of_frame in zip(*clouds, strict=True)])
     return Pairs(places, partners, normals, spacing, weights, share / frames), torch.stack(every, dim=-1)
 

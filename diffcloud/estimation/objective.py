@@ -130,7 +130,7 @@ class Objective:
     @property
     def cut(self) -> float | None:
         """Crop height of the recording in scene units, or None. Simulated points below it are omitted."""
-        return self._target.cut
+        return None if self._target.crop is None else self._target.crop.height
 
     @property
     def pose_space(self) -> PoseSpace:

@@ -21,9 +21,8 @@ _CUT_M = 0.002
 """The recording counts as cropped if its lowest points are this far [m] above the lowest initial cloth node."""
 _LOWEST = 0.005
 """Fraction of the recorded points that noise may move below the crop height."""
-_USABLE, _NEARLY, _TOO_LITTLE = 0.5, 0.8, 0.05
-"""A frame is usable if the first fraction of the cloth is above the crop height. If no frame reaches it, the second
-value times the largest fraction is required. The third value is the minimum in any case."""
+_USABLE = 0.05
+"""A frame is usable if this fraction of the cloth is above the crop height."""
 _MOST = 30
 """Maximum number of frames that are compared by default. More frames of a fast recording add little information."""
 _OUT_OF_REACH = 1e9
@@ -57,6 +56,29 @@ class LostPixels:
 
 
 @dataclass(frozen=True)
+class Crop:
+    """Height below which points were removed from a recording."""
+
+    height: float
+    noise: Tensor
+    """[L] mean squared distance of recorded points from the surface in each frame."""
+
+    def weights(self, heights: Tensor) -> Tensor:
+        """Return weights of points [..., L, N] by their heights: 0 below the crop height, 1 beyond the range of the noise.
+
+        Noise lifts a few of the many points on the table above the crop height. Near it, they can outnumber those of the
+        cloth. NaN gets 0.
+        """
+        above = heights - self.height
+        scale = (2 * self.noise).clamp(min=torch.finfo(self.noise.dtype).tiny)[:, None]
+        return torch.where(above > 0, -torch.expm1(-above.square() / scale), 0.0)
+
+    def at(self, chosen: list[int]) -> Crop:
+        """Return the crop for the frames with these indices."""
+        return Crop(self.height, self.noise[chosen])
+
+
+@dataclass(frozen=True)
 class Target:
     """One episode prepared for the loss, with L frames."""
 
@@ -70,8 +92,8 @@ class Target:
     """[C][L] points of each clock of `space`. A single distant point stands for an empty cloud."""
     sure: tuple[tuple[Tensor, ...], ...]
     """[C][L] weights of these points; zero for an empty cloud."""
-    cut: float | None
-    """Height below which the recording was cropped."""
+    crop: Crop | None
+    """None: the recording was not cropped."""
     viewpoints: Tensor | None
     """[cameras, 3] positions of the cameras in the recording's frame; None if unknown."""
     lost: tuple[LostPixels, ...]
@@ -107,6 +129,7 @@ class Target:
             self,
             frames=tuple(self.frames[one] for one in chosen),
             times=self.times[index],
+            crop=None if self.crop is None else self.crop.at(chosen),
             clouds=tuple(self.clouds[one] for one in chosen),
             views=tuple(tuple(view[one] for one in chosen) for view in self.views),
             sure=tuple(tuple(sure[one] for one in chosen) for sure in self.sure),
@@ -148,10 +171,18 @@ def read_target(
         else list(dict.fromkeys(_checked(scenario, episode, frame) for frame in named))
     )
     clouds = tuple(NeighbourIndex(torch.as_tensor(episode.frame(frame), dtype=torch.float64)) for frame in frames)
-    views, sure = [clouds], [tuple(_sure(episode, frame) for frame in frames)]
+    crop, every = None, [_sure(episode, frame) for frame in frames]
+    if height is not None:
+        crop = Crop(height, torch.tensor([cloud.from_surface[1] for cloud in clouds], dtype=torch.float64))
+        every = [
+            known * crop.at([index]).weights(cloud.points[None, :, 2])[0]
+            for index, (known, cloud) in enumerate(zip(every, clouds, strict=True))
+        ]
+    views, sure = [clouds], [tuple(every)]
     watching = [[] if whole else list(range(len(episode.viewpoints)))]
     if clocks is not ONE_CLOCK:
-        views, sure = map(list, zip(*(_of_camera(episode, frames, camera) for camera in range(len(clocks))), strict=True))
+        cameras = (_of_camera(episode, frames, every, camera) for camera in range(len(clocks)))
+        views, sure = map(list, zip(*cameras, strict=True))
         watching = _watching(episode)
     centre = torch.as_tensor(episode.points.mean(0, dtype=np.float64))  # independent of the chosen frames
     return Target(
@@ -160,7 +191,7 @@ def read_target(
         clouds,
         tuple(views),
         tuple(sure),
-        height,
+        crop,
         None if whole or not episode.viewpoints else torch.from_numpy(np.stack(list(episode.viewpoints.values()))),
         () if whole else _lost(episode, frames),
         None if whole else _planes(episode),
@@ -171,16 +202,20 @@ def read_target(
 
 
 def _of_camera(
-    episode: Episode, frames: Sequence[int], camera: int
+    episode: Episode, frames: Sequence[int], every: Sequence[Tensor], camera: int
 ) -> tuple[tuple[NeighbourIndex, ...], tuple[Tensor, ...]]:
-    """Return the points of one camera in each frame, and their weights."""
+    """Return the points of one camera in each frame, and their weights.
+
+    Args:
+        every: weights of all points of each frame.
+    """
     assert episode.camera is not None
     views, sure = [], []
-    for frame in frames:
+    for frame, known in zip(frames, every, strict=True):
         own = episode.camera[episode.offsets[frame] : episode.offsets[frame + 1]] == camera
         points = torch.as_tensor(episode.frame(frame)[own], dtype=torch.float64)
         views.append(NeighbourIndex(points if len(points) else torch.full((1, 3), _OUT_OF_REACH, dtype=torch.float64)))
-        sure.append(_sure(episode, frame)[own] if len(points) else torch.zeros(1, dtype=torch.float64))
+        sure.append(known[own] if len(points) else torch.zeros(1, dtype=torch.float64))
     return tuple(views), tuple(sure)
 
 
@@ -260,7 +295,8 @@ def _checked(scenario: Scenario, episode: Episode, frame: int) -> int:
 def _usable(
     scenario: Scenario, system: System, episode: Episode, track: Tensor | None, cut: float | None, late: float
 ) -> list[int]:
-    """Return the frames within the simulated time that show enough of the cloth above the crop height.
+    """Return the frames within the simulated time in which enough of the cloth, and a recorded point, are above the crop
+    height.
 
     The fraction of the cloth is computed from a simulation with the nominal material.
 
@@ -274,11 +310,14 @@ def _usable(
             run = rollout(system, scenario.steps, track=track, drop_diverged=True)
         heights = run.at(torch.as_tensor(episode.times[frames]))[0, ..., 2]
         above = ((heights >= cut) | heights.isnan()).double().mean(-1)  # NaN after divergence counts as above
-        enough = max(min(_USABLE, _NEARLY * float(above.max())), _TOO_LITTLE)
-        frames = [frame for frame, part in zip(frames, above.tolist(), strict=True) if part >= enough]
+        frames = [
+            frame
+            for frame, part in zip(frames, above.tolist(), strict=True)
+            if part >= _USABLE and (episode.frame(frame)[:, 2] > cut).any()
+        ]
     if not frames:
         unit, simulated = scenario.length_unit_m, scenario.steps * scenario.scene.time_step
-        told = "" if cut is None else f", at most {_TOO_LITTLE:.0%} of the cloth lies above the cut, {cut * unit:.3f} m"
+        told = "" if cut is None else f", less than {_USABLE:.0%} of the cloth lies above the cut, {cut * unit:.3f} m"
         raise EpisodeError(
             f"No frame of the episode can be compared: they lie at {episode.times[0]:.3f} to {episode.times[-1]:.3f} s, "
             f"scenario {scenario.name} simulates {simulated:.3f} s{told}. Name some with --frames, or check "

@@ -23,7 +23,7 @@ from diffcloud.estimation.solvers import LikelihoodSettings, fit_likelihood
 from diffcloud.io.episodes import Clock, Episode
 from diffcloud.sim.properties import one_set
 from tests.estimation.rates import check_rates
-from tests.estimation.test_matching import at_points
+from tests.estimation.test_matching import at_points, sharp_crop
 from tests.estimation.test_objective import SPACE, TRUTH, found_at, scenario_of
 
 PLACED = {"x": 0.1, "y": 0.1, "yaw": 0.5}
@@ -164,9 +164,10 @@ def test_clocks_that_agree_split_no_cloud(generator):
     """The nearest point of either camera is the nearest of all."""
     moved = torch.rand(2, 2, 40, 3, generator=generator, dtype=torch.float64)
     points = torch.rand(2, 30, 3, generator=generator, dtype=torch.float64)
-    whole, _ = pairs_forth(at_points(moved), [moved], [[NeighbourIndex(one) for one in points]], cut=0.2, share=0.5)
+    crop = sharp_crop(0.2, frames=2)
+    whole, _ = pairs_forth(at_points(moved), [moved], [[NeighbourIndex(one) for one in points]], crop=crop, share=0.5)
     views = [[NeighbourIndex(one[side::2]) for one in points] for side in (0, 1)]
-    split, _ = pairs_forth(at_points(moved), [moved, moved], views, nodes=40, cut=0.2, share=0.5)
+    split, _ = pairs_forth(at_points(moved), [moved, moved], views, nodes=40, crop=crop, share=0.5)
     assert torch.equal(split.partners, whole.partners)
     assert torch.equal(split.weights, whole.weights)
     clock = split.places.nodes // 40

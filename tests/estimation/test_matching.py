@@ -15,7 +15,7 @@ from diffcloud.clouds.sampling import SurfacePoints
 from diffcloud.clouds.visibility import seen_places
 from diffcloud.estimation.matching import Motion, Pairs, nearest_places, pairs_forth
 from diffcloud.estimation.pose import NUISANCE, PoseSpace
-from diffcloud.estimation.targets import LostPixels
+from diffcloud.estimation.targets import Crop, LostPixels
 from diffcloud.mesh.shapes import grid_cloth
 
 
@@ -76,6 +76,11 @@ def test_faces_without_area_have_a_nearest_place():
     torch.testing.assert_close(found[0, 0, :, 0], torch.tensor([0.5, 0.0, 1.0], dtype=torch.float64))
 
 
+def sharp_crop(height, frames=1):
+    """A crop of recordings without noise."""
+    return Crop(height, torch.zeros(frames, dtype=torch.float64))
+
+
 def at_points(moved):
     """Places that are points by themselves: each its own node."""
     nodes = torch.arange(moved.shape[2]).reshape(1, 1, -1, 1).expand(*moved.shape[:3], 3)
@@ -108,18 +113,37 @@ class TestSurface:
         assert across**0.5 == pytest.approx(1e-4 * (1 + 1 / 12) ** 0.5, rel=0.1)
 
 
+class TestCrop:
+    NOISE = 0.002
+
+    def weights(self, heights):
+        return Crop(0.1, torch.tensor([self.NOISE**2], dtype=torch.float64)).weights(heights[None])[0]
+
+    def test_weights_rise_from_zero_over_the_noise(self):
+        above = self.NOISE * torch.tensor([-1.0, 0.0, 1e-6, 1.0, 5.0, torch.nan], dtype=torch.float64)
+        expected = torch.tensor([0.0, 0.0, 0.0, 1 - math.exp(-0.5), 1.0, 0.0], dtype=torch.float64)
+        torch.testing.assert_close(self.weights(0.1 + above), expected, rtol=0, atol=1e-5)
+
+    def test_a_table_beside_the_cloth_hardly_counts(self, generator):
+        """Ten times as many points lie on the table as on the cloth. Noise lifts 6 % of them above the crop."""
+        table, cloth = (torch.randn(count, generator=generator, dtype=torch.float64) for count in (100_000, 10_000))
+        table = self.weights(0.1 + self.NOISE * (table - 1.55))
+        assert 0.05 < float((table > 0).double().mean()) < 0.07
+        assert float(table.sum()) < 0.15 * float(self.weights(0.15 + self.NOISE * cloth).sum())
+
+
 class TestForth:
     def test_below_the_cut_nothing_counts(self, generator):
         moved = torch.rand(2, 1, 40, 3, generator=generator, dtype=torch.float64)
         clouds = [NeighbourIndex(torch.rand(30, 3, generator=generator, dtype=torch.float64))]
-        pairs, _ = pairs_forth(at_points(moved), [moved], [clouds], cut=0.4, share=1.0)
+        pairs, _ = pairs_forth(at_points(moved), [moved], [clouds], crop=sharp_crop(0.4), share=1.0)
         assert torch.equal(pairs.weights > 0, moved[..., 2] >= 0.4)
         torch.testing.assert_close(pairs.weights.sum((1, 2)), torch.ones(2, dtype=torch.float64))
 
     def test_the_partner_is_the_nearest(self, generator):
         moved = torch.rand(2, 2, 40, 3, generator=generator, dtype=torch.float64)
         clouds = [NeighbourIndex(torch.rand(30, 3, generator=generator, dtype=torch.float64)) for _ in range(2)]
-        pairs, _ = pairs_forth(at_points(moved), [moved], [clouds], cut=None, share=0.5)
+        pairs, _ = pairs_forth(at_points(moved), [moved], [clouds], crop=None, share=0.5)
         for frame, cloud in enumerate(clouds):
             expected = torch.cdist(moved[:, frame], cloud.points.expand(2, -1, -1)).amin(-1)
             torch.testing.assert_close((moved[:, frame] - pairs.partners[:, frame]).norm(dim=-1), expected)
