@@ -16,6 +16,7 @@ from diffcloud.estimation.parameters import FitSpace
 from diffcloud.estimation.record import LeftOut
 from diffcloud.estimation.solvers import LikelihoodSettings, Progress, solve
 from diffcloud.sim.properties import one_set
+from diffcloud.sim.threads import map_threads
 
 Tell = Callable[[float, str, Progress], None]
 """Progress callback of (fraction of recordings done, label, progress of the current fit)."""
@@ -42,8 +43,10 @@ def leave_each_out(
         KeyboardInterrupt: Ctrl-C.
     """
     objective.reseed(settings.seed)  # a solver may have resampled the points
-    told, count = [], len(objective.members)
-    for index, member in enumerate(objective.members):
+    count = len(objective.members)
+
+    def leave_out(index: int) -> LeftOut:
+        member = objective.members[index]
         shown = None if progress is None else partial(progress, index / count, f"leaving out {index + 1} of {count}")
         others = JointObjective([*objective.members[:index], *objective.members[index + 1 :]])
         found = _from(others, space.without_recording(index), without_recording(values, index), settings, shown)
@@ -57,8 +60,9 @@ def leave_each_out(
             loss = float(member.losses(motion).mean())  # without the pose prior, like the reported loss of the joint fit
             rms_mm = 1e3 * member.scenario.length_unit_m * float(member.squares(motion).mean()) ** 0.5
         parameters = {name: value for name, value in lying.fixed.items() if not is_initial_state(name)}
-        told.append(LeftOut(loss=loss, rms_mm=rms_mm, parameters=parameters))
-    return told
+        return LeftOut(loss=loss, rms_mm=rms_mm, parameters=parameters)
+
+    return map_threads(leave_out, range(count))
 
 
 def _from(

@@ -70,13 +70,17 @@ Found = TypeVar("Found")
 
 def map_threads(function: Callable[[Given], Found], given: Iterable[Given]) -> list[Found]:
     """Apply a function to each item in threads, and return the results in order. The calling thread's setting for recording
-    torch gradients applies. Simulations inside the function end soon after Ctrl-C."""
+    torch gradients applies. Simulations inside the function end soon after Ctrl-C, also in nested calls."""
     import torch  # imported here, because commands that only set the number of threads do not need it
 
     items, recording = list(given), torch.is_grad_enabled()
     if min(len(items), thread_count()) < 2:
         return [function(item) for item in items]
-    interrupted = threading.Event()
+    interrupted, outer = threading.Event(), getattr(_here, "interrupted", None)
+
+    def look() -> None:
+        if outer is not None and outer.is_set():
+            raise KeyboardInterrupt
 
     def run(item: Given) -> Found:
         _here.interrupted = interrupted
@@ -84,7 +88,7 @@ def map_threads(function: Callable[[Given], Found], given: Iterable[Given]) -> l
             return function(item)
 
     with ThreadPoolExecutor(min(thread_count(), len(items))) as pool:
-        return _finish([pool.submit(run, item) for item in items], lambda: None, interrupted.set)
+        return _finish([pool.submit(run, item) for item in items], look, interrupted.set)
 
 
 def _pool() -> ThreadPoolExecutor:

@@ -7,6 +7,7 @@ import signal
 import threading
 import time
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -248,7 +249,8 @@ class TestFit:
         finally:
             use_threads(None)
 
-    def test_ctrl_c_ends_what_threads_simulate(self):
+    @pytest.mark.parametrize("nested", [False, True])
+    def test_ctrl_c_ends_what_threads_simulate(self, nested):
         """They would take minutes."""
         system, _ = small_lift().scene.build()
         rollout(system, 1)  # compiled
@@ -256,8 +258,9 @@ class TestFit:
         threading.Timer(0.5, os.kill, (os.getpid(), signal.SIGINT)).start()
         try:
             use_threads(2)
+            simulate = partial(map_threads, lambda steps: rollout(system, steps))
             with pytest.raises(KeyboardInterrupt):
-                map_threads(lambda steps: rollout(system, steps), [100_000, 100_000, 100_000])
+                map_threads(simulate, [[100_000] * 2] * 2) if nested else simulate([100_000] * 3)
         finally:
             use_threads(None)
         assert time.monotonic() - began < 10  # on a busy machine
