@@ -31,8 +31,6 @@ _BACKTRACKS = 3
 _NEAR = 0.5
 """Where the next step is smaller than this, in standard deviations, the refined mesh is simulated. If that was done at a
 point within this distance, its result is used again."""
-_NARROW = 0.05
-"""Smallest bound on a step after divergence or an increase of Φ."""
 _GAINS, _BEHIND = 3.0, 20.0
 """A start is abandoned if its expected Φ is above the best one by more than the second number. The expected Φ is its
 current value minus the first number times the gain that the next step predicts."""
@@ -102,7 +100,7 @@ class Descent:
             except DivergedError:
                 if best is None:
                     raise
-                place, radius = 0.5 * (place + best.place), max(0.5 * radius, _NARROW)
+                place, radius = 0.5 * (place + best.place), 0.5 * radius
                 continue
             if self._correction is None:
                 self._correction = of.nearest(place) or self._corrected(linear, place)
@@ -111,7 +109,7 @@ class Descent:
                 tried += 1
                 if tried > _BACKTRACKS:
                     break
-                place, radius = 0.5 * (place + best.place), max(0.5 * radius, _NARROW)
+                place, radius = 0.5 * (place + best.place), 0.5 * radius
                 continue
             tried = 0
             step = self._step(terms, place, radius)
