@@ -100,7 +100,7 @@ def export(
 
 
 def _draws(record: FitRecord, path: Path, count: int, seed: int) -> list[dict[str, float]]:
-    """Multipliers of all parameters, the given ones too."""
+    """Return parameter sets drawn from the intervals of a fit, as multipliers of all its parameters."""
     from diffcloud.evaluation.intervals import draws, read_intervals
     from diffcloud.evaluation.methods import space_of
 

@@ -29,9 +29,8 @@ _LEAST_S = 1.2
 _EARLY_S = 1.5
 """The horizon is first sought in the frames up to this time [s], because it is seldom later."""
 _FEWEST = 5
-"""Minimum number of frames up to the horizon. If a recording was cut high above the table, only one or two early frames
-show the cloth. With five frames, the mean RMS of six published recordings, over the frames that count, is 11.9 mm. With one
-or two it is 15.6 mm."""
+"""Minimum number of frames. A simulation that departs from the first frame on would otherwise be fitted to that frame
+alone."""
 _FAR = 100.0
 """Bound on a pose variable, in standard deviations."""
 _FAR_GRIP = 2.0
