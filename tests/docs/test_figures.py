@@ -67,6 +67,12 @@ FIGURES = [
     ),
     Figure(
         "docs/limits.md",
+        r"finer towels of this simulator, (?P<held>\d+ of \d+) do",
+        FOREIGN,
+        r"\| finer \|(?:[^|]*\|){5} (?P<held>\d+ of \d+) \|",
+    ),
+    Figure(
+        "docs/limits.md",
         r"(?P<held>\d+ of \d+) bending intervals .* is (?P<times>[\d.]+) times too large",
         FOREIGN,
         r"\| towels \|(?:[^|]*\|){5} (?P<held>\d+ of \d+) \|(?s:.*) overestimated: (?P<times>[\d.]+) times",
