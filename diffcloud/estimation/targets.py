@@ -154,8 +154,8 @@ def read_target(
         nuisance: pose variables -> standard deviation of the prior [m, rad, s].
 
     Raises:
-        EpisodeError: a frame is missing or after the end of the simulation, no frame is usable, the grippers differ
-            from the scene's, or viewpoints, crop planes or clocks are invalid.
+        EpisodeError: a frame is missing, after the end of the simulation, or without points above the crop height, no
+            frame is usable, the grippers differ from the scene's, or viewpoints, crop planes or clocks are invalid.
         ConfigError: a pose variable is unknown.
     """
     unit = scenario.length_unit_m
@@ -178,6 +178,12 @@ def read_target(
             known * crop.at([index]).weights(cloud.points[None, :, 2])[0]
             for index, (known, cloud) in enumerate(zip(every, clouds, strict=True))
         ]
+        hidden = [str(frame) for frame, weights in zip(frames, every, strict=True) if not weights.any()]
+        if hidden:  # named frames; others have points above
+            raise EpisodeError(
+                f"Frames {', '.join(hidden)} have no point above the crop height, {height * unit:.3f} m. Omit them from "
+                "--frames or the scene's loss_frames."
+            )
     views, sure = [clouds], [tuple(every)]
     watching = [[] if whole else list(range(len(episode.viewpoints)))]
     if clocks is not ONE_CLOCK:

@@ -232,6 +232,11 @@ class TestWhatCounts:
         with pytest.raises(EpisodeError, match=r"of the cloth lies above the cut, 9\.000 m"):
             Objective(scenario, replace(episode, meta=meta | {"cut_planes": planes | {"one": planes["two"]}}))
 
+    def test_a_named_frame_needs_points_above_the_cut(self, scenario, episode):
+        meta = {"cameras": ["one"], "viewpoints": {"one": [0.1, 0.1, 9.0]}, "cut_planes": {"one": [0.0, 0.0, 1.0, 0.05]}}
+        with pytest.raises(EpisodeError, match=r"^Frames 0, 1 have no point above the crop height, 0\.050 m"):
+            Objective(scenario, replace(episode, meta=meta), frames=[0, 12, 1])
+
     def test_frames_are_those_with_enough_above_the_lowest_cut_plane(self, scenario, episode):
         """Also where the points alone would not show that they were cut."""
         meta = {"cameras": ["one", "two"], "viewpoints": {"one": [0.1, 0.1, 9.0], "two": [0.1, 0.2, 9.0]}}
